@@ -88,14 +88,6 @@ def test_a_column_in_adc_is_no_energy_unless_calibrated(file, raw):
         open_pulses(file, energy="nope")
 
 
-def test_without_a_column_the_amplitude_is_calibrated(file):
-    values = np.full((N, 200), 100, np.uint16)
-    values[:, 150] = 100 + np.arange(N)
-    write_table(file, "t", values)
-    energies = open_pulses(file, kev_per_adc=0.25).read().energy_kev
-    np.testing.assert_allclose(energies, 0.25 * np.arange(N))
-
-
 def test_energies_of_another_file(file, tmp_path, raw):
     write_table(file, "ch1/raw", raw)
     hit = write_table(tmp_path / "hit.lh5", "ch1/hit", E_cal=np.arange(N) * 1.5)

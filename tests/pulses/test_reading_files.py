@@ -112,23 +112,6 @@ def test_datasets_and_attributes_without_values(tmp_path):
         open_pulses(path)
 
 
-@pytest.mark.parametrize(
-    ("start", "words"),
-    [
-        (b"root\0\0", "is a ROOT file, which is not read; read its traces with uproot"),
-        (b"\xe7\xca", "is a CAEN CoMPASS file, .*; convert it with legend-daq2lh5"),
-        (b"\x1f\x8b\x08", "is a compressed file, which is not read; unpack it"),
-        (b"MATLAB 5.0 MAT-file", "is a MATLAB 5 file, .*; save it with -v7.3"),
-    ],
-)
-def test_files_of_other_programs_are_named(tmp_path, start, words):
-    """As of CoMPASS, https://github.com/legend-exp/pygama/pull/23."""
-    path = tmp_path / "run_1.BIN"
-    path.write_bytes(start + bytes(700))
-    with pytest.raises(CpunetError, match=words):
-        open_pulses(path)
-
-
 def test_what_is_missing_is_unknown_in_arrays_of_any_kind():
     """NumPy drops masks without a word: https://github.com/numpy/numpy/issues/26669."""
     masked = np.ma.masked_array([1.0, 2.0, 3.0], [False, True, False])
@@ -146,17 +129,25 @@ def test_what_is_missing_is_unknown_in_arrays_of_any_kind():
     np.testing.assert_array_equal(Pulses.of(jagged, dt_ns=16).waveforms, np.eye(3))
 
 
-PNG = b"\x89PNG\r\n\x1a\n" + bytes(600)
-
-
-@pytest.mark.parametrize("suffix", [".lh5", ".h5", ".fcio", ".npz", ".npy", ".dat", ""])
-@pytest.mark.parametrize("content", [b"", PNG, b"\0" * 700], ids=["empty", "png", "zeros"])
-def test_foreign_files(tmp_path, suffix, content):
-    path = tmp_path / f"file{suffix}"
-    path.write_bytes(content)
-    with pytest.raises(CpunetError, match=r"^[^\n]*file[^\n]*: [^\n]*; [^\n]*$") as error:
+@pytest.mark.parametrize("suffix", [".lh5", ".fcio", ".npz", ".npy", ""])
+@pytest.mark.parametrize(
+    ("start", "words"),
+    [
+        (None, "is empty; copy"),
+        (b"\x89PNG\r\n\x1a\n", "of no known format; give LH5"),
+        (b"", "of no known format; give LH5"),  # zeros
+        (b"root\0\0", "is a ROOT file, which is not read; read its traces with uproot"),
+        (b"\xe7\xca", "is a CAEN CoMPASS file, .*; convert it with legend-daq2lh5"),
+        (b"\x1f\x8b\x08", "is a compressed file, which is not read; unpack it"),
+        (b"MATLAB 5.0 MAT-file", "is a MATLAB 5 file, .*; save it with -v7.3"),
+    ],
+)
+def test_foreign_files_are_named_by_their_content(tmp_path, suffix, start, words):
+    """As of CoMPASS, https://github.com/legend-exp/pygama/pull/23."""
+    path = tmp_path / f"run_1{suffix}"
+    path.write_bytes(b"" if start is None else start + bytes(700))
+    with pytest.raises(CpunetError, match=rf"^[^\n]*run_1{suffix}: {words}[^\n]*$"):
         open_pulses(path, dt_ns=16)
-    assert ("is empty" in str(error.value)) == (content == b"")
 
 
 @pytest.fixture(scope="module")

@@ -56,8 +56,8 @@ def crossing(steps: Values, fraction: float) -> Values:
     array([2.25])
     """
     top = (steps >= RISE_END).argmax(axis=1)
-    crossed, last = last_below(steps, top, np.full(len(steps), fraction))
-    last = np.minimum(last, steps.shape[1] - 2)
+    last = last_below(steps, top, np.full(len(steps), fraction))
+    crossed, last = last >= 0, np.minimum(last, steps.shape[1] - 2)
     rows = np.arange(len(steps))
     low, high = steps[rows, last], steps[rows, last + 1]
     rise = np.where(crossed, high - low, 1.0)

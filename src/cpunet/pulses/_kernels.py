@@ -7,8 +7,9 @@ float64.  Traces are read in place and never copied.
 from __future__ import annotations
 
 import math
+from collections import namedtuple
 from enum import IntEnum
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -27,44 +28,12 @@ compiled: Any = kernel(error_model="numpy")
 _compiled_finite: Any = kernel(error_model="numpy", fastmath={"nnan", "nsz", "reassoc"})
 
 
-@compiled
-def all_finite(trace):  # type: ignore[no-untyped-def]
-    bad = False
-    for value in trace:
-        bad |= (value - value) != 0
-    return not bad
-
-
-@_compiled_finite
-def lowest_of(trace):  # type: ignore[no-untyped-def]
-    lowest = trace[0]
-    for value in trace:
-        lowest = min(lowest, value)
-    return lowest
-
-
-@_compiled_finite
-def highest_of(trace):  # type: ignore[no-untyped-def]
-    highest = trace[0]
-    for value in trace:
-        highest = max(highest, value)
-    return highest
-
-
 @_compiled_finite
 def mean_of(trace):  # type: ignore[no-untyped-def]
     total = 0.0
     for value in trace:
         total += np.float64(value)
     return total / len(trace)
-
-
-@compiled
-def first_at(trace, level):  # type: ignore[no-untyped-def]
-    sample = 0
-    while trace[sample] != level:
-        sample += 1
-    return sample
 
 
 @compiled
@@ -93,28 +62,6 @@ def line(values):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def quietest_rms(baseline):  # type: ignore[no-untyped-def]
-    """RMS about a straight line in the quietest part of the baseline."""
-    size, quietest = len(baseline) // _PARTS, math.inf
-    for part in range(_PARTS):
-        quietest = min(quietest, line(baseline[part * size : (part + 1) * size])[2])
-    return quietest
-
-
-@compiled
-def _equal_neighbours(trace):  # type: ignore[no-untyped-def]
-    """Fraction of equal neighbouring samples, and the smallest step between unequal ones."""
-    equal, step = 1, math.inf  # start at 1: a probability is never exactly zero
-    for i in range(1, len(trace)):
-        difference = abs(trace[i] - trace[i - 1])
-        if difference == 0:
-            equal += 1
-        else:
-            step = min(step, difference)
-    return equal / len(trace), step
-
-
-@compiled
 def is_saturated(trace, quiet, top, top_sample, saturation_run):  # type: ignore[no-untyped-def]
     """Whether the top of a measured trace is flatter than noise and ADC steps can explain.
 
@@ -122,26 +69,21 @@ def is_saturated(trace, quiet, top, top_sample, saturation_run):  # type: ignore
     mostly does (coarse steps, or no noise), the fall after the flat top decides: clipping
     cuts off far more than one step.
     """
-    longest = end = 0  # length and end of the longest run of `top`
-    for sample in range(top_sample, len(trace), saturation_run):  # no long run fits in between
-        if trace[sample] == top:
-            start = stop = sample
-            while start > top_sample and trace[start - 1] == top:
-                start -= 1
-            while stop < len(trace) and trace[stop] == top:
-                stop += 1
-            if stop - start > longest:
-                longest, end = stop - start, stop
+    longest = run = end = 0  # length and end of the longest run of `top`
+    for sample in range(top_sample, len(trace)):
+        run = run + 1 if trace[sample] == top else 0
+        if run > longest:
+            longest, end = run, sample + 1
     if longest < saturation_run:
         return False
     if top == 65535 or top == 16383 or top == 4095:  # full scale of 16, 14 and 12 bits
         return True
-    chance, _ = _equal_neighbours(trace[:quiet])
-    if chance ** (longest - 1) < _FLAT_BY_CHANCE:
-        return True
-    _, step = _equal_neighbours(trace)
+    steps = np.abs(np.diff(trace))
+    # one more than there are: a probability is never exactly zero
+    chance = (1 + (steps[: quiet - 1] == 0).sum()) / quiet
     fall = top - trace[min(end + longest, len(trace)) - 1]
-    return chance > 0.5 and fall > _FLAT_BY_STEPS * step
+    clipped = chance > 0.5 and fall > _FLAT_BY_STEPS * steps[steps > 0].min()
+    return clipped or chance ** (longest - 1) < _FLAT_BY_CHANCE
 
 
 @_compiled_finite
@@ -154,27 +96,17 @@ def _residual_squares(tail, logs, mean, slope):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def tail_fit(tail, rms, logs):  # type: ignore[no-untyped-def]
+def tail_fit(tail, rms):  # type: ignore[no-untyped-def]
     """Slope per sample of the logarithm and reduced chi-square; NaN if a value is ≤ 0."""
-    if lowest_of(tail) <= 0:
+    if tail.min() <= 0:
         return math.nan, math.nan
-    for i in range(len(tail)):
-        logs[i] = math.log(tail[i])
+    logs = np.log(tail).astype(np.float64)
     mean, slope, _ = line(logs)
     if rms == 0:
         return slope, math.nan
     # The error of a logarithm is the relative error of the value.
     squares = _residual_squares(tail, logs, mean, slope)
     return slope, squares / (rms * rms * (len(tail) - 2))
-
-
-@compiled
-def tail_mean(trace, stop, tail_samples):  # type: ignore[no-untyped-def]
-    """Mean of the `tail_samples` before `stop`; the last value replaces missing samples."""
-    total = 0.0
-    for i in range(stop - tail_samples, stop):
-        total += np.float64(trace[min(i, len(trace) - 1)])
-    return total / tail_samples
 
 
 class Rejection(IntEnum):
@@ -226,39 +158,14 @@ SMOOTHED_NS = 480.0
 PREPARED_NS, _NORMALISED = 128.0, 1e-5
 
 
-class Settings(NamedTuple):
-    """The preparation settings in the form that the compiled loop accepts, in samples."""
-
-    simulated: bool
-    samples_before: int
-    samples_after: int
-    of_maximum: float  # at which pulses are aligned; 0 for half of the height
-    baseline_samples: int
-    tail_samples: int
-    tail_level: float
-    decay_fit_samples: int
-    max_padding_before: int
-    max_padding_after: int
-    saturation_run: int
-    smoothed: int
-    begun_margin: int
-    prepared: int
-
-
-@compiled
-def _charge_before(trace, start, stop):  # type: ignore[no-untyped-def]
-    """Level of a simulated pulse before any charge has moved.
-
-    This is its lowest value, unless the pulse already rises at the first sample.  The value of
-    that sample is then charge that moved within it and must not be subtracted as a baseline.
-    """
-    first = max(start, 0)
-    lowest = np.float64(lowest_of(trace[first:stop]))
-    if first == 0 and len(trace) > 1 and lowest == trace[0]:
-        rise = np.float64(trace[1]) - lowest
-        if 0 < lowest <= _MAX_FIRST * rise:
-            return 0.0
-    return lowest
+# The preparation settings in the form that the compiled loop accepts, in samples; `of_maximum`
+# is where pulses are aligned, 0 for half of the height.
+Settings = namedtuple(
+    "Settings",
+    "simulated samples_before samples_after of_maximum baseline_samples tail_samples "
+    "tail_level decay_fit_samples max_padding_before max_padding_after saturation_run "
+    "smoothed begun_margin prepared",
+)
 
 
 @compiled
@@ -270,11 +177,18 @@ def _baseline_stretch(length, start, s):  # type: ignore[no-untyped-def]
 
 @compiled
 def _base_of_window(trace, start, stop, s):  # type: ignore[no-untyped-def]
-    """Level of a window before its pulse."""
-    if s.simulated:
-        return _charge_before(trace, start, min(stop, len(trace)))
-    first, last = _baseline_stretch(len(trace), start, s)
-    return mean_of(trace[first:last])
+    """Level of a window before its pulse.
+
+    For a simulated pulse this is its lowest value, unless it already rises at the first sample.
+    The value of that sample is then charge that moved within it and must not be subtracted as a
+    baseline.
+    """
+    if not s.simulated:
+        first, last = _baseline_stretch(len(trace), start, s)
+        return mean_of(trace[first:last])
+    lowest = np.float64(trace[max(start, 0) : min(stop, len(trace))].min())
+    moved = start <= 0 and 0 < lowest == trace[0]
+    return 0.0 if moved and lowest <= _MAX_FIRST * (np.float64(trace[1]) - lowest) else lowest
 
 
 @compiled
@@ -282,7 +196,7 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
     """Align, compute the baseline of that window, and repeat until nothing moves."""
     length = len(trace)
     if s.simulated:
-        base = _charge_before(trace, 0, length)
+        base = _base_of_window(trace, 0, length, s)
     else:
         base = mean_of(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
     align = -1
@@ -300,8 +214,8 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
         align = refined
         start, stop = align - s.samples_before, min(align + s.samples_after, length)
         if top_sample >= stop:
-            top = np.float64(highest_of(trace[align:stop]))
-            top_sample = align + first_at(trace[align:stop], top)
+            top = np.float64(trace[align:stop].max())
+            top_sample = align + trace[align:stop].argmax()
         base = _base_of_window(trace, start, stop, s)
     return align, base, top
 
@@ -322,43 +236,31 @@ def _smooth(trace, half, smooth):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _level_at(trace, align, s):  # type: ignore[no-untyped-def]
-    """Base, height and rise of the tail of a pulse that is aligned at a sample.
+def _half_crossing(trace, smooth, align, s):  # type: ignore[no-untyped-def]
+    """When a pulse that is aligned at a sample passes half of its height.
 
-    The height is that of a straight line through the tail at the alignment: a decay takes
-    nothing from it, and noise moves it little.
+    Time in samples, base, height, and rise of the tail.  The height is that of a straight line
+    through the tail at the alignment: a decay takes nothing from it, and noise moves it little.
+    The crossing is searched backward from the plateau; the averaged trace decides which of
+    several crossings by noise is meant.
     """
-    length, start, stop = len(trace), align - s.samples_before, align + s.samples_after
-    base, n = _base_of_window(trace, start, stop, s), s.decay_fit_samples
-    centre, total, moment = 0.5 * (n - 1), 0.0, 0.0
-    for k in range(n):
-        value = np.float64(trace[max(min(stop - n + k, length - 1), 0)])
-        total += value
-        moment += (k - centre) * value
-    slope = moment / (n * (n * n - 1.0) / 12.0)
-    height = total / n + slope * (align - (stop - n + centre)) - base
-    return base, height, slope * n
+    start, stop, n = align - s.samples_before, align + s.samples_after, s.decay_fit_samples
+    base, centre, last = _base_of_window(trace, start, stop, s), 0.5 * (n - 1), len(trace) - 1
+    tail = trace[np.minimum(np.arange(stop - n, stop), last)].astype(np.float64)
+    slope = ((np.arange(n) - centre) * tail).sum() / (n * (n * n - 1.0) / 12.0)
+    height = tail.sum() / n + slope * (align - (stop - n + centre)) - base
 
-
-@compiled
-def _half_crossing(trace, smooth, align, level, s):  # type: ignore[no-untyped-def]
-    """Time in samples at which a pulse passes a level, searched backward from its plateau.
-
-    The averaged trace decides which of several crossings by noise is meant.
-    """
-    length = len(trace)
-    near = min(align + s.samples_after - s.decay_fit_samples, length - 1)
-    while near >= 0 and smooth[near] >= level:
-        near -= 1
-    sample = min(near + s.smoothed + 1, length - 1)
-    while sample >= 0 and trace[sample] >= level:
-        sample -= 1
-    if sample < 0:
-        return 0.0  # charge that moved within the first sample
-    if sample == length - 1:
-        return float(length)
-    low, high = np.float64(trace[sample]), np.float64(trace[sample + 1])
-    return sample + (level - low) / (high - low)
+    level = base + 0.5 * height
+    near = min(crossing(smooth, min(stop - n, last), level) + s.smoothed, last)
+    sample = crossing(trace, near, level) - 1
+    if sample < 0:  # charge that moved within the first sample
+        time = 0.0
+    elif sample == last:
+        time = last + 1.0
+    else:
+        low, high = np.float64(trace[sample]), np.float64(trace[sample + 1])
+        time = sample + (level - low) / (high - low)
+    return time, base, height, slope * n
 
 
 @compiled
@@ -368,90 +270,73 @@ def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     _smooth(trace, s.smoothed, smooth)
     if length == s.samples_before + s.samples_after:  # prepared already?
         align = s.samples_before
-        base, height, rise = _level_at(trace, align, s)
+        time, base, height, rise = _half_crossing(trace, smooth, align, s)
         if s.simulated:
-            scale = np.float64(highest_of(trace))
+            scale = np.float64(trace.max())
         else:
-            scale = tail_mean(trace, length, s.tail_samples) / s.tail_level
+            scale = mean_of(trace[length - s.tail_samples :]) / s.tail_level
         normalised = abs(base) < _NORMALISED and abs(scale - 1.0) < _NORMALISED
         near = max(s.prepared, _NEAREST) if normalised else _NEAREST
-        if abs(_half_crossing(trace, smooth, align, base + 0.5 * height, s) - align) < near:
+        if abs(time - align) < near:
             return align, base, height, rise
-    top = highest_of(smooth)
-    top_sample = first_at(smooth, top)
-    base = np.float64(lowest_of(smooth))
+    top = smooth.max()
+    top_sample = smooth.argmax()
+    base = smooth.min()
     if not s.simulated:
         base = mean_of(trace[: min(s.baseline_samples, max(1, top_sample // 2), length)])
     align = crossing(smooth, top_sample, base + 0.5 * (top - base))
     nearest, best = math.inf, (align, base, 0.0, 0.0)
     for _ in range(_ROUNDS):
-        base, height, rise = _level_at(trace, align, s)
-        time = _half_crossing(trace, smooth, align, base + 0.5 * height, s)
+        time, base, height, rise = _half_crossing(trace, smooth, align, s)
         if abs(time - align) < nearest:
             nearest, best = abs(time - align), (align, base, height, rise)
         if nearest < _NEAREST:
             break
-        align = math.floor(time + 0.5)
+        align = math.floor(min(max(time, 0.0), length) + 0.5)
     return best
 
 
 @compiled
-def _jumps(smooth, align, rise, s):  # type: ignore[no-untyped-def]
-    """Whether most of the rise of a tail is within the time over which noise is averaged."""
-    width = 2 * s.smoothed + 1
-    first = max(align + s.samples_after - s.decay_fit_samples, 0)
-    for i in range(first, min(align + s.samples_after, len(smooth)) - width):
-        if smooth[i + width] - smooth[i] > 0.5 * rise:
-            return True
-    return False
-
-
-@compiled
-def _before_pulse(trace, align, base, top, rms, s):  # type: ignore[no-untyped-def]
-    """The `baseline_samples` of the record before the pulse begins; at least three.
+def _quiet(trace, start, mean, align, top, s):  # type: ignore[no-untyped-def]
+    """RMS in the quietest part of the baseline; slope and RMS of the record before the pulse.
 
     The baseline part of a window can contain the start of a slow pulse, whose slope would
-    make the quality cuts remove long drift times.  A pulse that begins in the first half of
-    that part is not slow: it is a piled-up pulse, which is left in so that the cuts find it.
+    make the quality cuts remove long drift times: the last `baseline_samples` before the pulse
+    begins have neither.  A pulse that begins in the first half of that part is not slow: it is
+    a piled-up pulse, which is left in so that the cuts find it.
     """
-    level = base + max(_BEGUN_FRACTION * (top - base), _BEGUN_RMS * rms)
+    first, last = _baseline_stretch(len(trace), start, s)
+    size = (last - first) // _PARTS
+    quietest = math.inf if size else 0.0
+    for part in range(first, first + _PARTS * size, max(size, 1)):
+        quietest = min(quietest, line(trace[part : part + size])[2])
+    level = mean + max(_BEGUN_FRACTION * (top - mean), _BEGUN_RMS * quietest)
     begun = crossing(trace, min(align, len(trace) - 1), level)
-    middle = align - s.samples_before + s.baseline_samples // 2
-    stop = min(max(begun - s.begun_margin, middle, 3), len(trace))
-    return max(stop - s.baseline_samples, 0), stop
+    stop = min(max(begun - s.begun_margin, start + s.baseline_samples // 2, 3), len(trace))
+    _, slope, rms = line(trace[max(stop - s.baseline_samples, 0) : stop])
+    return quietest, slope, rms
 
 
 @compiled
-def _fill(trace, start, base, scale, window):  # type: ignore[no-untyped-def]
-    """Write `(trace - base) / scale`: 0 before the record, its last value after it."""
-    length, factor = len(trace), 1.0 / scale
-    first, stop = max(0, -start), min(len(window), length - start)
-    window[:first] = 0
-    for i in range(first, stop):
-        window[i] = (trace[start + i] - base) * factor
-    window[stop:] = (trace[length - 1] - base) * factor
-
-
-@compiled
-def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-untyped-def]
+def _prepare_one(trace, s, window, numbers, smooth):  # type: ignore[no-untyped-def]
     """Fill a window and numbers from a trace and return its code.
 
     The numbers are baseline, scale, aligned sample, RMS and slope of the baseline over the
     scale, slope of the logarithm of the tail, and its chi-square; slopes are per sample.
     """
-    if not all_finite(trace):
+    if not np.isfinite(trace).all():
         return Rejection.NAN
-    length, top = len(trace), np.float64(highest_of(trace))
-    if top == lowest_of(trace):
+    length, top = len(trace), np.float64(trace.max())
+    if top == trace.min():
         return Rejection.CONSTANT
-    top_sample = first_at(trace, top)
+    top_sample = trace.argmax()
     quiet = min(s.baseline_samples, max(2, top_sample // 2), length)
     if not s.simulated and is_saturated(trace, quiet, top, top_sample, s.saturation_run):
         return Rejection.SATURATED
 
     if s.of_maximum == 0:
         align, base, height, rise = _aligned_half(trace, smooth, s)
-        top = np.float64(highest_of(trace[: min(align + s.samples_after, length)]))
+        top = np.float64(trace[: align + s.samples_after].max())
     else:
         align, base, top = _aligned(trace, top, top_sample, s)
         height, rise = top - base, 0.0
@@ -462,32 +347,37 @@ def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-un
     if s.simulated:
         scale = top - base
     else:
-        quietest = quietest_rms(trace[first:last])
+        quietest, slope, rms = _quiet(trace, start, mean, align, top, s)
         if height < (_MIN_HEIGHT_RMS if s.of_maximum == 0 else _MIN_TOP_RMS) * quietest:
             return Rejection.NO_AMPLITUDE
-        first, last = _before_pulse(trace, align, mean, top, quietest, s)
-        _, slope, rms = line(trace[first:last])
         # no samples for the baseline, or more to fill in than is allowed
         before = min(s.max_padding_before, s.baseline_samples - 1)
         if start < -before or stop > length + s.max_padding_after:
-            highest, quiet_base = highest_of(trace), mean_of(trace[:quiet])
-            if highest - quiet_base < _MAX_RISE * (highest - lowest_of(trace)):
+            highest = trace.max()
+            if highest - mean_of(trace[:quiet]) < _MAX_RISE * (highest - trace.min()):
                 return Rejection.NO_AMPLITUDE  # the pulse goes down
             short = length + before + s.max_padding_after < len(window)
             return Rejection.WINDOW_OUTSIDE_RECORD if short else Rejection.PULSE_AT_EDGE
         base = mean
-        scale = (tail_mean(trace, stop, s.tail_samples) - base) / s.tail_level
+        tail = trace[np.minimum(np.arange(stop - s.tail_samples, stop), length - 1)]
+        scale = (tail.astype(np.float64).mean() - base) / s.tail_level
         if rise > max(_MAX_RISE * height, _MAX_RISE_RMS * quietest):
-            jumps = _jumps(smooth, align, rise, s)
+            # most of it within the time over which noise is averaged?
+            part, width = smooth[stop - s.decay_fit_samples : stop], 2 * s.smoothed + 1
+            jumps = (part[width:] - part[:-width] > 0.5 * rise).any()
             return Rejection.SECOND_PULSE if jumps else Rejection.NO_PLATEAU
     if not scale > 0:
         return Rejection.NO_AMPLITUDE
 
-    _fill(trace, start, base, scale, window)
-    tail_slope, chi2 = tail_fit(window[-s.decay_fit_samples :], rms / scale, logs)
+    # 0 before the record, its last value after it
+    samples = np.minimum(np.maximum(np.arange(start, stop), 0), length - 1)
+    window[:] = (trace[samples] - base) * (1.0 / scale)
+    window[: max(0, -start)] = 0
+    noise = rms / scale
+    tail_slope, chi2 = tail_fit(window[-s.decay_fit_samples :], noise)
     if math.isnan(tail_slope):
         return Rejection.TAIL_NOT_POSITIVE
-    numbers[0], numbers[1], numbers[2], numbers[3] = base, scale, align, rms / scale
+    numbers[0], numbers[1], numbers[2], numbers[3] = base, scale, align, noise
     numbers[4], numbers[5], numbers[6] = slope / scale, tail_slope, chi2
     return Rejection.ACCEPTED
 
@@ -495,9 +385,8 @@ def _prepare_one(trace, s, window, numbers, logs, smooth):  # type: ignore[no-un
 @compiled
 def prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
     """Prepare all traces; accepted ones fill the first rows.  Return their number."""
-    logs, smooth = np.empty(s.decay_fit_samples), np.empty(waveforms.shape[1])
-    n = 0
+    smooth, n = np.empty(waveforms.shape[1]), 0
     for i in range(len(waveforms)):
-        codes[i] = _prepare_one(waveforms[i], s, windows[n], numbers[n], logs, smooth)
+        codes[i] = _prepare_one(waveforms[i], s, windows[n], numbers[n], smooth)
         n += codes[i] == Rejection.ACCEPTED
     return n

@@ -89,13 +89,10 @@ def paired(sim: PulseFile, data: PulseFile) -> dict[str, Pair | CpunetError]:
     """
     measured = channels_of(data)
     if CHANNEL in str(sim.path):
-        return {
-            name: (replace(sim, path=Path(str(sim.path).replace(CHANNEL, name))), file)
-            for name, file in measured.items()
-        }
-    if sim.table != ALL:
-        return {name: (sim, file) for name, file in measured.items()}
-    simulated = channels_of(sim)
+        paths = {name: Path(str(sim.path).replace(CHANNEL, name)) for name in measured}
+        simulated = {name: replace(sim, path=path) for name, path in paths.items()}
+    else:
+        simulated = channels_of(sim) if sim.table == ALL else dict.fromkeys(measured, sim)
     names = ", ".join(simulated)
     return {
         name: (simulated[name], file)
@@ -151,8 +148,8 @@ def each_channel(
             f"{out}: is the output of one channel; choose another `out` for the folders of "
             f"{len(channels)}"
         )
-    make = partial(_work, dict(channels), out, do)
     arrived: dict[str, R | CpunetError] = {}
+    make = partial(partial, _one_channel, dict(channels), out, do)  # called in each process
     with (
         stage("Channels", len(channels)) as bar,
         closing(outcomes(make, list(channels), usable_cores())) as results,
@@ -169,19 +166,17 @@ def each_channel(
     )
 
 
-def _work(
-    channels: Mapping[str, Pair | CpunetError], out: Path, do: Callable[[str, Pair, Path], R]
-) -> Callable[[str], R]:
-    """The work of each process: one channel after another."""
-
-    def work(name: str) -> R:
-        pair = channels[name]
-        if isinstance(pair, CpunetError):
-            raise pair
-        log.info(f"{name}:")
-        return do(name, pair, out / name)
-
-    return work
+def _one_channel(
+    channels: Mapping[str, Pair | CpunetError],
+    out: Path,
+    do: Callable[[str, Pair, Path], R],
+    name: str,
+) -> R:
+    pair = channels[name]
+    if isinstance(pair, CpunetError):
+        raise pair
+    log.info(f"{name}:")
+    return do(name, pair, out / name)
 
 
 def own_folder(folder: Path, name: str, file: str) -> Path:

@@ -94,17 +94,13 @@ class Pulses:
         """Build a set from array-likes, with defaults for unknown quantities."""
         values = _numbers(waveforms, np.float32, "waveforms")
         n = len(values)
+        kev = np.full(n, np.nan) if energy_kev is None else energy_kev
+        numbers = np.arange(n) if event_number is None else event_number
         return cls(
             waveforms=values,
             dt_ns=float(dt_ns),
-            energy_kev=(
-                np.full(n, np.nan)
-                if energy_kev is None
-                else _numbers(energy_kev, np.float64, "energy_kev")
-            ),
-            event_number=(
-                np.arange(n) if event_number is None else np.asarray(event_number, np.int64)
-            ),
+            energy_kev=_numbers(kev, np.float64, "energy_kev"),
+            event_number=np.asarray(numbers, np.int64),
             peak=np.full(n, "") if peak is None else np.asarray(peak, np.str_),
             t0_ns=np.broadcast_to(np.asarray(t0_ns, float), (n,)),
         )
@@ -133,8 +129,7 @@ class Pulses:
         """Event number, energy in keV and gamma line of each pulse, as a data frame."""
         from pandas import DataFrame
 
-        columns = ("event_number", "energy_kev", "peak")
-        return DataFrame({name: getattr(self, name) for name in columns})
+        return DataFrame({n: getattr(self, n) for n in ("event_number", "energy_kev", "peak")})
 
     def save(self, path: str | Path, *, force: bool = False) -> Path:
         """Write the pulses to an LH5 file.
@@ -173,15 +168,14 @@ class Pulses:
 def _numbers(values: npt.ArrayLike, kind: type[np.floating[Any]], name: str) -> Any:
     """Plain numbers of anything like an array; what is masked, which NumPy drops, is NaN."""
     try:
-        plain = np.asarray(values, kind)
+        if isinstance(values, np.ma.MaskedArray):
+            values = np.ma.filled(values.astype(kind), np.nan)
+        return np.asarray(values, kind)
     except (ValueError, TypeError) as error:  # of awkward as of NumPy
         raise CpunetError(
             f"{name}: no plain numbers ({str(error).splitlines()[0][:100]})",
             "give rows of equal length, and NaN for what is missing",
         ) from error
-    if isinstance(values, np.ma.MaskedArray):
-        plain = np.where(np.ma.getmaskarray(values), kind(np.nan), plain)
-    return plain
 
 
 def blocks(n: int, size: int = BLOCK) -> Iterator[slice]:

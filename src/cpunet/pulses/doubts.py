@@ -7,24 +7,19 @@ from __future__ import annotations
 
 import logging
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.peaks import EnergySelection, suggested_calibration
 from cpunet.pulses.reading.source import amplitude
-
-if TYPE_CHECKING:  # compiled loops, which a look into a file does not need
-    from cpunet.pulses.preparation import Kind
 
 log = logging.getLogger(__name__)
 
 Values = npt.NDArray[np.float64]
 
-MAX_KEV, MIN_KEV = 20_000.0, 20.0  # typical range of gamma energies
 LOW_KEV = 300.0  # at lower energies, noise can be a good part of an amplitude
 MIN_PULSES = 30
 # Relative deviation from the common gain of what does not go together, and share of pulses up
@@ -37,9 +32,8 @@ MAX_MISMATCHED, FEW_MISMATCHED = 0.2, 0.1
 # rate, and least factors by which noise and slope change there.
 SMOOTHED, MARGIN, MIN_NOISE, MIN_SLOPE = 64, 0.1, 1.2, 1.5
 # Counts that roll over: least period and number of traces, and share of the steep ones;
-# shares of traces: why no pulse is left, and from which all are refused.
-LEAST_PERIOD, MIN_ROLLED, MOSTLY = 256, 3, 0.9
-FEW_ROLLED, MAX_ROLLED = 0.02, 0.2
+# share of traces from which all are refused.
+LEAST_PERIOD, MIN_ROLLED, MOSTLY, MAX_ROLLED = 256, 3, 0.9, 0.2
 
 
 class RolledOver(NamedTuple):
@@ -188,42 +182,3 @@ def require_sense(path: Path, traces: FloatArray, kev: Values, amplitudes: Value
             f"{begins[1]:.0f} samples were averaged from there: a second rate; cut the traces "
             "there, or resample them"
         )
-
-
-def explained(
-    error: CpunetError,
-    path: Path,
-    traces: FloatArray,
-    kev: Values,
-    amplitudes: Values,
-    side: Kind,
-    selection: EnergySelection,
-) -> CpunetError:
-    """Why no pulse can be used, if traces or energies show it; else the error as it is."""
-    rolled = rolled_over(traces)
-    if rolled is not None and rolled.share >= FEW_ROLLED:
-        return CpunetError(f"{path}: {rolled}", rolled.remedy)
-    if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
-        return CpunetError(
-            f"{path}: the traces go down: their polarity is negative",
-            "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",
-        )
-    kev = kev[np.isfinite(kev)]
-    if not len(kev):
-        calibration = suggested_calibration(amplitudes)
-        text = f"{error}; their amplitudes look like {calibration}"
-        return error if calibration is None else CpunetError(text)
-    if selection.select(kev).any():
-        return error
-    low, middle, high = np.quantile(kev, (0.05, 0.5, 0.95))
-    text = f"{error}. Energies there: {low:.4g} to {high:.4g} keV, half of them above "
-    text += f"{middle:.4g}"
-    give = "give `kev_per_adc`" if side == "measured" else "multiply them in the file by"
-    from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
-    if high > MAX_KEV and side == "measured":
-        text += f": if these are ADC counts, {give}"
-    elif 0 < high < MIN_KEV:
-        text += f": if these are MeV, {give} 1000"
-    elif n := int((kev >= from_kev).sum()):
-        text += f"; `peak` {from_kev:.0f}- takes {n} pulses"
-    return CpunetError(text)

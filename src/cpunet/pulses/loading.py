@@ -18,9 +18,9 @@ from pydantic import BaseModel, ConfigDict, Field
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
-from cpunet.pulses.container import Pulses
-from cpunet.pulses.doubts import explained, require_sense
-from cpunet.pulses.peaks import EnergySelection, label_peaks
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.doubts import LOW_KEV, require_sense, rolled_over
+from cpunet.pulses.peaks import EnergySelection, label_peaks, suggested_calibration
 from cpunet.pulses.preparation import (
     Codes,
     CutWindows,
@@ -42,12 +42,16 @@ log = logging.getLogger(__name__)
 
 # Traces per block: 20 to 130 MB for the record lengths in use.
 BLOCK_SIZE = 4096
-FEW = 10  # pulses of the wanted energies whose rejection is a reason
 RATE_TRACES = 512  # first traces of a file, which are checked
+# Why no pulse is left: least number of pulses of the wanted energies and least share of traces
+# that roll over, and typical range of gamma energies.
+FEW, FEW_ROLLED = 10, 0.02
+MAX_KEV, MIN_KEV = 20_000.0, 20.0
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 # Windows are shorter by these if so many more of a file's first traces contain them.
 SHORTER_NS, MORE, TRIED = range(320, 3201, 320), 0.01, 1024
 SWAPPED = "are `sim` and `data` swapped?"
+
 
 _REMEDIES = {
     Rejection.NAN: "where NaN pads pulses, continue their last value, or write them again",
@@ -205,7 +209,7 @@ def load_pulses(
     with file.open() as source:
         require_side(source, side, SWAPPED, insist=file.insist)
         how = (recipe, selection, max_pulses, shorten)
-        inputs, parts, whole, whole_rows = _read(source, file, side, *how)
+        inputs, parts, whole = _read(source, file, side, *how)
     recipe, prepared = inputs.recipe.at(inputs.dt_ns), inputs.prepared
     if side == "measured":
         cuts = fit_cuts(prepared, recipe.cuts)
@@ -214,8 +218,8 @@ def load_pulses(
             raise CpunetError(
                 f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
             )
-        passed = Pulses.concatenate(whole)[np.isin(np.concatenate(whole_rows), prepared.index)]
-        baselines = Baselines.concatenate(parts, passed)
+        passed = [traces[np.isin(rows, prepared.index)] for rows, traces in whole]
+        baselines = Baselines.concatenate(parts, Pulses.concatenate(passed))
         inputs = replace(inputs, prepared=prepared, cuts=cuts, baselines=baselines)
     elif tell:
         ends = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
@@ -253,7 +257,7 @@ def _within_traces(block: Pulses, recipe: Recipe, name: str) -> Recipe:
         edge = np.isin(codes, (Rejection.PULSE_AT_EDGE, Rejection.WINDOW_OUTSIDE_RECORD))
         return float(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
 
-    share, tried = outside(recipe), list[Recipe]()
+    tried = [recipe]
     for by in SHORTER_NS:
         after, decay = windows.after_ns - by, windows.decay_fit_ns - by
         if min(after - training.level_ns, decay) > 0:
@@ -262,12 +266,12 @@ def _within_traces(block: Pulses, recipe: Recipe, name: str) -> Recipe:
             changed = {"preparation": windows.model_copy(update=to), "training": within}
             tried.append(recipe.model_copy(update=changed))
     shares = np.array([outside(shorter) for shorter in tried])
-    if share - shares.min(initial=share) <= MORE:
+    if shares[0] - shares.min() <= MORE:
         return recipe
     best = tried[int(np.argmax(shares <= shares.min() + 0.5 * MORE))]
     end = best.preparation.after_ns
     log.warning(
-        f"{name}: {100 * share:.2g} % of the traces end before their windows "
+        f"{name}: {100 * shares[0]:.2g} % of the traces end before their windows "
         f"would; these end {end:g} ns after the alignment, not {windows.after_ns:g} ns"
     )
     return best
@@ -281,7 +285,7 @@ def _read(
     selection: EnergySelection,
     max_pulses: int | None,
     shorten: bool,
-) -> tuple[InputSet, list[Baselines], list[Pulses], list[Rows]]:
+) -> tuple[InputSet, list[Baselines], list[tuple[Rows, Pulses]]]:
     """Read, select, prepare and collect the pulses of a file in one pass.
 
     Without quality cuts; also baselines, and whole traces with their rows.
@@ -292,7 +296,7 @@ def _read(
     """
     sets, drawn, before = list[Prepared](), list[FloatColumn](), set[int]()
     seen = list[tuple[FloatColumn, FloatColumn]]()
-    baselines, whole, whole_rows = list[Baselines](), list[Pulses](), list[Rows]()
+    baselines, whole = list[Baselines](), list[tuple[Rows, Pulses]]()
     first, rng, start, n = np.empty((0, 0), np.float32), np.random.default_rng(0), 0, 0
     lowest, highest, counts = np.inf, -np.inf, None
     with stage(f"Preparing {source.path.name}", source.n_pulses) as bar:
@@ -302,19 +306,17 @@ def _read(
                 if shorten:
                     recipe = _within_traces(block[:TRIED], recipe, source.path.name)
                 config = recipe.at(source.dt_ns).preparation
-            all_of_it = None
-            if side == "measured" and sum(map(len, baselines)) < TRACES:
-                all_of_it = prepare(block, config, side)  # baselines of any energy
+            # baselines are of pulses of any energy
+            of_all = side == "measured" and sum(map(len, baselines)) < TRACES
+            part, prepared = _selected(block, config, side, selection, before, of_all)
+            if of_all:
                 like = baselines[:1]
-                baselines.append(Baselines.of_block(block, all_of_it, config, *like))
-            part = _selected(block, config, side, selection, all_of_it)
-            part = part.rejected(_copies(block[part.index], side, before))
+                baselines.append(Baselines.of_block(block, prepared, config, *like))
             if side == "measured":
                 good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
                 lowest, highest = good.min(initial=lowest), good.max(initial=highest)
-                rows = part.index[: max(WHOLE - sum(map(len, whole)), 0)]
-                whole.append(block[rows])
-                whole_rows.append(start + rows)
+                rows = part.index[: max(WHOLE - sum(len(traces) for _, traces in whole), 0)]
+                whole.append((start + rows, block[rows]))
             seen.append((block.energy_kev, amplitude(block.waveforms)))
             sets.append(part)
             drawn.append(rng.random(len(part)))
@@ -324,8 +326,8 @@ def _read(
             bar.update(len(block))
     energies, heights = map(np.concatenate, zip(*seen, strict=True))
     if not n:
-        error = _nothing_left(source.path, np.concatenate([part.codes for part in sets]))
-        raise explained(error, source.path, first, energies, heights, side, selection)
+        codes = np.concatenate([part.codes for part in sets])
+        raise _nothing_left(source.path, codes, first, energies, heights, side, selection)
     if max_pulses is not None and n > max_pulses:
         _thin(sets, drawn, max_pulses)
     if side == "measured" and not file.insist:
@@ -337,7 +339,7 @@ def _read(
         _joined(sets), source.dt_ns, source.path, energies, recipe, None, file.options,
         recorded_detector(source), None, counts,
     )  # fmt: skip
-    return inputs, baselines, whole, whole_rows
+    return inputs, baselines, whole
 
 
 def _joined(sets: list[Prepared]) -> Prepared:
@@ -359,36 +361,31 @@ def _selected(
     config: PreparationConfig,
     side: Kind,
     selection: EnergySelection,
-    prepared: Prepared | None,
-) -> Prepared:
-    """The selected pulses of a block, those of `prepared` if all of it is prepared already."""
+    before: set[int],
+    of_all: bool,
+) -> tuple[Prepared, Prepared]:
+    """The selected pulses of a block, and all that were prepared: `of_all`, or these.
+
+    Pulses read `before`, as of rows written twice, are copies.  Simulated pulses without noise
+    can be alike; their events must be the same, too.
+    """
     codes: Codes = np.zeros(len(block), np.uint8)
     codes[~selection.select(block.energy_kev)] = Rejection.ENERGY_OUTSIDE_SELECTION
     codes[~np.isfinite(block.energy_kev)] = Rejection.ENERGY_UNKNOWN
-    if prepared is None:
-        rows = np.flatnonzero(codes == Rejection.ACCEPTED)
-        part = prepare(block[rows], config, side)
-        codes[rows] = part.codes
-        part = replace(part, index=rows[part.index], codes=codes)
-    else:
-        part = prepared.rejected(codes[prepared.index])
-        part = replace(part, codes=np.where(codes == Rejection.ACCEPTED, part.codes, codes))
-    peak = label_peaks(part.pulses.energy_kev, selection.peaks)
-    return replace(part, pulses=replace(part.pulses, peak=peak))
-
-
-def _copies(pulses: Pulses, side: Kind, before: set[int]) -> Codes:
-    """Codes of pulses, in which those read before, as of rows written twice, are copies.
-
-    Simulated pulses without noise can be alike; their events must be the same, too.
-    """
-    codes: Codes = np.zeros(len(pulses), np.uint8)
-    numbers = pulses.event_number if side == "simulated" else codes
-    for row, (trace, number) in enumerate(zip(pulses.waveforms, numbers, strict=True)):
-        key = hash((int(number), trace.tobytes()))
-        codes[row] = Rejection.COPIES if key in before else Rejection.ACCEPTED
+    rows = np.arange(len(block)) if of_all else np.flatnonzero(codes == Rejection.ACCEPTED)
+    prepared = prepare(block[rows], config, side)
+    index, selected = rows[prepared.index], codes[rows[prepared.index]] == Rejection.ACCEPTED
+    codes[rows] = np.where(codes[rows] == Rejection.ACCEPTED, prepared.codes, codes[rows])
+    part = replace(prepared, index=index, codes=codes)[selected]
+    copies: Codes = np.zeros(len(part), np.uint8)
+    for number, row in enumerate(part.index):
+        event = block.event_number[row] if side == "simulated" else 0
+        key = hash((int(event), block.waveforms[row].tobytes()))
+        copies[number] = Rejection.COPIES if key in before else Rejection.ACCEPTED
         before.add(key)
-    return codes
+    part = part.rejected(copies)
+    peak = label_peaks(part.pulses.energy_kev, selection.peaks)
+    return replace(part, pulses=replace(part.pulses, peak=peak)), prepared
 
 
 def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> int:
@@ -401,13 +398,49 @@ def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> in
     return max_pulses
 
 
-def _nothing_left(path: Path, codes: Codes) -> CpunetError:
+def _nothing_left(
+    path: Path,
+    codes: Codes,
+    traces: FloatArray,
+    kev: FloatColumn,
+    amplitudes: FloatColumn,
+    side: Kind,
+    selection: EnergySelection,
+) -> CpunetError:
+    """Why no pulse can be used, as traces or energies show it, or the most frequent reason."""
+    rolled = rolled_over(traces)
+    if rolled is not None and rolled.share >= FEW_ROLLED:
+        return CpunetError(f"{path}: {rolled}", rolled.remedy)
+    if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
+        return CpunetError(
+            f"{path}: the traces go down: their polarity is negative",
+            "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",
+        )
     reasons = ", ".join(f"{n} {reason}" for reason, n in rejections_of(codes).items())
     text = f"{path}: none of {len(codes)} pulses can be used ({reasons})"
     # of pulses of the wanted energies, if there are any, since these are what is missed
     wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)
     reason = int((wanted if wanted.sum() >= FEW else np.bincount(codes)).argmax())
-    return CpunetError(text, _REMEDIES[Rejection(reason)])
+    error = CpunetError(text, _REMEDIES[Rejection(reason)])
+    kev = kev[np.isfinite(kev)]
+    if not len(kev):
+        calibration = suggested_calibration(amplitudes)
+        text = f"{error}; their amplitudes look like {calibration}"
+        return error if calibration is None else CpunetError(text)
+    if selection.select(kev).any():
+        return error
+    low, middle, high = np.quantile(kev, (0.05, 0.5, 0.95))
+    text = f"{error}. Energies there: {low:.4g} to {high:.4g} keV, half of them above "
+    text += f"{middle:.4g}"
+    give = "give `kev_per_adc`" if side == "measured" else "multiply them in the file by"
+    from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
+    if high > MAX_KEV and side == "measured":
+        text += f": if these are ADC counts, {give}"
+    elif 0 < high < MIN_KEV:
+        text += f": if these are MeV, {give} 1000"
+    elif n := int((kev >= from_kev).sum()):
+        text += f"; `peak` {from_kev:.0f}- takes {n} pulses"
+    return CpunetError(text)
 
 
 def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection) -> list[str]:

@@ -14,13 +14,8 @@ undefined value is NaN and never raises an exception.
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib.util import find_spec, module_from_spec
-from threading import Lock
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -119,8 +114,11 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
         means = around.reshape(-1, 2 * reach + 1) @ weights.T
         return np.asarray(means.reshape(len(current), -1).max(axis=1))
 
-    def one_block(block: FloatArray) -> Values:
-        current = np.diff(block, axis=1)
+    require_pulses(waveforms, 2 * reach + 2)
+    amplitudes = np.empty(len(waveforms))
+    # samples and averages near the steepest point are as many more as the period is shorter
+    for rows in blocks(len(waveforms), max(1, round(BLOCK * min(1.0, dt_ns / REFERENCE_NS)))):
+        current = np.diff(np.ascontiguousarray(waveforms[rows], np.float32), axis=1)
         samples = current.shape[1]
         n = min(near, samples)
         first = np.clip(current.argmax(axis=1) - n // 2, 0, samples - n)[:, np.newaxis]
@@ -131,11 +129,8 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
         np.put_along_axis(elsewhere, first + np.arange(2 * reach, n - 2 * reach), -np.inf, 1)
         if len(unsure := np.flatnonzero(~(elsewhere.max(axis=1) <= values))):
             values[unsure] = highest(current[unsure])
-        return values
-
-    # samples and averages near the steepest point are as many more as the period is shorter
-    size = max(1, round(BLOCK * min(1.0, dt_ns / REFERENCE_NS)))
-    return _by_blocks(one_block, waveforms, 2 * reach + 2, size)
+        amplitudes[rows] = values
+    return amplitudes
 
 
 def current_amplitude_kernel(dt_ns: float) -> npt.NDArray[np.float32]:
@@ -203,14 +198,15 @@ def drift_time(waveforms: FloatArray, dt_ns: float, start_fraction: float) -> Va
     >>> drift_time(ramp[np.newaxis], dt_ns=16, start_fraction=0.01).round(3)
     array([3168.])
     """
-
-    def one_block(block: FloatArray) -> Values:
+    require_pulses(waveforms, 2)
+    times = np.empty(len(waveforms))
+    for rows in blocks(len(waveforms), BLOCK):
+        block = np.asarray(waveforms[rows], np.float32)
         # the fraction in single precision, as of the pulse
         end, levels = block.argmax(axis=1), start_fraction * block.max(axis=1)
         start = crossings(block.astype(float), levels.astype(float), end)
-        return np.asarray((end - start) * dt_ns)
-
-    return _by_blocks(one_block, waveforms, shortest=2)
+        times[rows] = (end - start) * dt_ns
+    return times
 
 
 def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
@@ -249,16 +245,13 @@ def tail_slope(waveforms: FloatArray, dt_ns: float, fit_samples: int) -> Values:
     >>> (-1e3 / tail_slope(decay, dt_ns=16, fit_samples=300)).round(2)  # in µs
     array([54.6])
     """
-    weights = line_slope(fit_samples) / (dt_ns * 1e-6)
-
-    def one_block(block: FloatArray) -> Values:
-        tail = block[:, -fit_samples:].astype(float)
+    require_pulses(waveforms, fit_samples)
+    weights, slopes = line_slope(fit_samples) / (dt_ns * 1e-6), np.full(len(waveforms), np.nan)
+    for rows in blocks(len(waveforms), BLOCK):
+        tail = np.asarray(waveforms[rows, -fit_samples:], np.float32).astype(float)
         usable = (np.isfinite(tail) & (tail > 0)).all(axis=1)
-        slopes = np.full(len(tail), np.nan)
-        slopes[usable] = np.log(tail[usable]) @ weights
-        return slopes
-
-    return _by_blocks(one_block, waveforms, shortest=fit_samples)
+        slopes[rows][usable] = np.log(tail[usable]) @ weights
+    return slopes
 
 
 def pulse_parameters(
@@ -291,20 +284,6 @@ def pulse_parameters(
     }
 
 
-def _by_blocks(
-    function: Callable[[FloatArray], Values],
-    waveforms: FloatArray,
-    shortest: int,
-    size: int = BLOCK,
-) -> Values:
-    """Apply `function` to blocks of pulses of at least `shortest` samples."""
-    require_pulses(waveforms, shortest)
-    values = np.empty(len(waveforms))
-    for rows in blocks(len(waveforms), size):
-        values[rows] = function(np.ascontiguousarray(waveforms[rows], dtype=np.float32))
-    return values
-
-
 BISECTIONS = 30  # of one sample: a precision of 1e-9
 PAD = 8  # samples of the edge value; the effect of the spline's end falls 3.7-fold per sample
 
@@ -322,42 +301,25 @@ def _spline(near: Sequence[Values], t: Values) -> Values:
     return np.asarray(a + b + c + d)
 
 
-_IMPORT = Lock()
-
-
-@cache
-def processors() -> tuple[Any, ...]:
-    """Dspeed's processors, without its reading of files, which takes seconds to import."""
-    with _IMPORT:
-        bare = "dspeed" not in sys.modules
-        if bare and (spec := find_spec("dspeed")) is not None:
-            sys.modules["dspeed"] = module_from_spec(spec)  # its folder alone, nothing is run
-        try:
-            from dspeed.processors.pole_zero import pole_zero
-            from dspeed.processors.time_point_thresh import interpolated_time_point_thresh
-            from dspeed.processors.trap_filters import trap_norm, trap_pickoff
-        finally:
-            for name in [m for m in sys.modules if bare and m.partition(".")[0] == "dspeed"]:
-                del sys.modules[name]
-    return pole_zero, interpolated_time_point_thresh, trap_norm, trap_pickoff
-
-
 def crossings(waveforms: Values, levels: Values, stops: npt.NDArray[np.int64]) -> Values:
     """Times in samples of the last crossings of levels before a sample; NaN without any.
 
     They are those of dspeed's ``interpolated_time_point_thresh``, backward and with straight
     lines between samples, of waveforms ``(..., length)``, a level and a sample for each.
     """
-    return np.asarray(processors()[1](waveforms, levels, stops, 0, ord("l")))
+    from dspeed.processors.time_point_thresh import interpolated_time_point_thresh  # a second
+
+    return np.asarray(interpolated_time_point_thresh(waveforms, levels, stops, 0, ord("l")))
 
 
 def last_below(
-    waveforms: FloatArray | Values, top: npt.NDArray[np.intp], level: FloatArray | Values
-) -> tuple[npt.NDArray[np.bool_], npt.NDArray[np.intp]]:
-    """Whether each pulse is below a level before its `top`, and the last such sample."""
+    waveforms: FloatArray | Values, stops: npt.NDArray[np.intp], level: FloatArray | Values
+) -> npt.NDArray[np.intp]:
+    """The last sample before a stop at which each pulse is below a level; -1 without any."""
     below = waveforms < level[:, np.newaxis]
-    below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
-    return np.asarray(below.any(axis=1)), waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    below &= np.arange(waveforms.shape[1]) < stops[:, np.newaxis]
+    last = waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    return np.where(below.any(axis=1), last, -1)
 
 
 def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> FloatArray:
@@ -419,8 +381,8 @@ def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     finite = np.isfinite(waveforms).all(axis=1)
     top = np.where(finite, waveforms.argmax(axis=1), 0)
     height = waveforms[np.arange(len(waveforms)), top]
-    crosses, before = last_below(waveforms, top, 0.5 * height)
-    if not (usable := finite & (height > 0) & crosses).any():
+    before = last_below(waveforms, top, 0.5 * height)
+    if not (usable := finite & (height > 0) & (before >= 0)).any():
         return moved
     pulses, before = waveforms[usable], before[usable]
     padded = np.pad(pulses.astype(float), ((0, 0), (PAD, PAD)), mode="edge")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -98,26 +98,18 @@ class EnergySelection:
     @property
     def parts(self) -> list[EnergySelection]:
         """Its lines and ranges, each as a selection of its own."""
-        lines = [EnergySelection(name, self.peaks, (name,)) for name in self.chosen]
-        return lines + [
-            EnergySelection(
-                f"{low:.12g}-" if high == np.inf else f"{low:.12g}-{high:.12g}",
-                self.peaks,
-                (),
-                ((low, high),),
-            )
-            for low, high in self.ranges_kev
-        ]
+        parts = [EnergySelection(name, self.peaks, (name,)) for name in self.chosen]
+        for low, high in self.ranges_kev:
+            name = f"{low:.12g}-" if high == np.inf else f"{low:.12g}-{high:.12g}"
+            parts.append(EnergySelection(name, self.peaks, (), ((low, high),)))
+        return parts
 
     @property
     def lines_in_ranges(self) -> list[str]:
         """Lines that were not chosen by name but lie in a chosen range."""
-        return [
-            name
-            for name, line in self.peaks.items()
-            if name not in self.chosen
-            and any(low <= line.energy_kev < high for low, high in self.ranges_kev)
-        ]
+        others = {name: line for name, line in self.peaks.items() if name not in self.chosen}
+        in_ranges = replace(self, chosen=()).select([x.energy_kev for x in others.values()])
+        return [name for name, inside in zip(others, in_ranges, strict=True) if inside]
 
     def select(self, energy_kev: npt.ArrayLike) -> npt.NDArray[np.bool_]:
         """Mask of the selected energies (keV, shape ``(n,)``); False for NaN."""
@@ -274,7 +266,7 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
     under = 3 * np.maximum(np.median(around, axis=1), 0.3 * around.mean(axis=1))
     near = np.convolve(counts, np.ones(3), "same")
     excess = (near - under) / np.sqrt(np.maximum(under, 1.0))
-    best: tuple[float, Suggestion] | None = None
+    best, suggestion = -np.inf, None
     for source, lines_kev in SOURCES.items():
         places = np.log(lines_kev) / LOG_BIN
         offsets = np.round(places - places[0]).astype(int)
@@ -288,14 +280,12 @@ def suggested_calibration(amplitudes: npt.ArrayLike) -> Suggestion | None:
         # two lines coincide by chance more easily than three
         limit = CLEAR if len(lines_kev) > 2 else 2 * CLEAR
         clear = tuple(np.array(lines_kev)[values[shift] > limit].tolist())
-        if not np.isfinite(score[shift]) or len(clear) < min(MIN_LINES, len(lines_kev)):
-            continue
-        if best is None or score[shift] > best[0]:
+        if score[shift] > best and len(clear) >= min(MIN_LINES, len(lines_kev)):
             # from the amplitudes near the highest line
             log_factor = float(places[0] * LOG_BIN - edges[0] - (shift + 0.5) * LOG_BIN)
             line = max(clear)
             of_line = logs[np.abs(logs + log_factor - np.log(line)) < 2 * LOG_BIN]
             middle = float(np.median(of_line)) if len(of_line) else np.log(line) - log_factor
-            factor = float(line / np.exp(middle))
-            best = float(score[shift]), Suggestion(factor, source, clear)
-    return None if best is None else best[1]
+            best = float(score[shift])
+            suggestion = Suggestion(float(line / np.exp(middle)), source, clear)
+    return suggestion

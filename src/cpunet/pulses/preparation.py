@@ -220,16 +220,10 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     windows.resize((n, length), refcheck=False)  # releases the other rows without a copy
     baseline, scale, align, rms, slope, tail_slope, chi2 = numbers[:n].T.copy()
     rows, per_ms = np.flatnonzero(codes == Rejection.ACCEPTED), 1e6 / pulses.dt_ns
-    begin = (align - config.samples_before) * pulses.dt_ns
+    events = pulses.with_waveforms(pulses.waveforms[:, :0])[rows]
+    t0_ns = events.t0_ns + (align - config.samples_before) * pulses.dt_ns
     return Prepared(
-        pulses=Pulses(
-            waveforms=windows,
-            dt_ns=pulses.dt_ns,
-            energy_kev=pulses.energy_kev[rows],
-            event_number=pulses.event_number[rows],
-            peak=pulses.peak[rows],
-            t0_ns=pulses.t0_ns[rows] + begin,
-        ),
+        pulses=replace(events, waveforms=windows, t0_ns=t0_ns),
         index=rows,
         baseline=baseline,
         scale=scale,
@@ -335,11 +329,9 @@ def apply_cuts(prepared: Prepared, cuts: CutWindows) -> Prepared:
     for window in cuts.windows:
         values, weights = _values(prepared, window.name, cuts.amplitude, cuts.noise)
         values = window.centre + (values - window.centre) * weights
-        outside = np.zeros(len(prepared), bool)
-        if window.low is not None:
-            outside |= values < window.low
-        if window.high is not None:
-            outside |= values > window.high
+        low = -np.inf if window.low is None else window.low
+        high = np.inf if window.high is None else window.high
+        outside = (values < low) | (values > high)
         reasons[outside & (reasons == Rejection.ACCEPTED)] = Rejection[window.name.upper()]
     return prepared.rejected(reasons)
 

@@ -6,6 +6,7 @@ What is in a file of pulses, in words: counts, energies, lines, traces.
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -205,6 +206,7 @@ MIN_BASELINE = 16  # minimum number of samples to estimate the noise
 MIN_NUMBER = 10  # minimum number of traces
 
 Words = list[tuple[str, str]]
+Values = npt.NDArray[np.float64]
 
 
 def trace_properties(whole: Pulses, config: PreparationConfig) -> Words:
@@ -280,9 +282,8 @@ def describe_pulses(
     peaks
         Gamma lines to count.
     """
-    energies, heights, extremes = [], [], [np.empty(0)]
-    n_pulses = n_not_finite = n_constant = n_copies = 0
-    seen = set[int]()
+    energies, heights, extremes = list[Values](), list[Values](), [np.empty(0)]
+    n_pulses, seen, odd = 0, set[int](), Counter[str]()
     for block in blocks:
         n_pulses += len(block)
         energies.append(of_block := block.energy_kev[np.isfinite(block.energy_kev)])
@@ -291,27 +292,26 @@ def describe_pulses(
         # A sum is NaN or infinite if any sample is; this needs no mask as large as the block.
         with np.errstate(invalid="ignore", over="ignore"):
             finite = np.isfinite(block.waveforms.sum(axis=1, dtype=np.float64))
-        n_not_finite += int((~finite).sum())
         good = block.waveforms if finite.all() else block.waveforms[finite]
         low, high = good.min(axis=1), good.max(axis=1)
-        n_constant += int((low == high).sum())
-        hashes = [hash(trace.tobytes()) for trace in good[low < high]]
-        n_copies += len(hashes) - len({*hashes} - seen)
-        seen.update(hashes)
         extremes += [low, high]
+        hashes = [hash(trace.tobytes()) for trace in good[low < high]]
+        odd["not finite"] += len(block) - len(good)
+        odd["constant"] += len(good) - len(hashes)
+        odd["copies of others"] += len(hashes) - len({*hashes} - seen)
+        seen.update(hashes)
     kev, samples = np.concatenate(energies), np.concatenate(extremes)
-    lines_at = suggested_calibration(kev if len(kev) else np.concatenate(heights))
+    calibration = suggested_calibration(kev if len(kev) else np.concatenate(heights))
     energy, origin, amplitudes = source.energies, "", ""
     if len(kev):
         energy += f", {span([kev.min(), kev.max()])} keV"
         energy += f"; {n_pulses - len(kev)} pulses have none" if len(kev) < n_pulses else ""
-        if lines_at is not None:
-            place = f"{1 / lines_at.kev_per_adc:.4f} of their energies"
-            origin = f"lines of {lines_at.source}, at {place}"
+        if calibration is not None:
+            place = f"{1 / calibration.kev_per_adc:.4f} of their energies"
+            origin = f"lines of {calibration.source}, at {place}"
     else:
-        amplitudes = "no lines that stand out" if lines_at is None else f"like {lines_at}"
-    lines, odd = label_peaks(kev, peaks), {"not finite": n_not_finite, "constant": n_constant}
-    odd["copies of others"] = n_copies
+        amplitudes = "no lines that stand out" if calibration is None else f"like {calibration}"
+    lines = label_peaks(kev, peaks)
     odds = "".join(f"; {n} traces {what}" for what, n in odd.items() if n)
     ends = [samples.min(), samples.max()] if len(samples) else None
     return [

@@ -26,7 +26,6 @@ from cpunet.pulses.parameters import (
     crossings,
     current_amplitude,
     drift_time,
-    processors,
     tail_slope,
 )
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
@@ -67,9 +66,10 @@ def legend_parameters(
     aligned
         Sample from which times count.
     """
+    from dspeed.processors.pole_zero import pole_zero
+    from dspeed.processors.trap_filters import trap_norm, trap_pickoff
     from scipy.signal import fftconvolve  # half of SciPy
 
-    pole_zero, _, trap_norm, trap_pickoff = processors()
     corrected = np.asarray(waveforms, float)
     if np.isfinite(decay_ns):
         corrected = pole_zero(corrected, decay_ns / dt_ns)
@@ -228,11 +228,9 @@ def all_parameters(
             columns |= dict(zip(TIME_POINTS, times.T, strict=True))
             for name, (begin, end) in RISE_TIMES.items():
                 columns[name] = columns[end] - columns[begin]
-        for name, column in columns.items():
-            values[name][good] = np.where(np.isfinite(column), column, np.nan)
-        noise = values["baseline_rms"][good]
-        how = (decay_ns, noise, dt_ns, preparation.samples_before)
-        for name, column in legend_parameters(block, *how).items():
+        columns = {name: np.where(np.isfinite(c), c, np.nan) for name, c in columns.items()}
+        how = (decay_ns, columns["baseline_rms"], dt_ns, preparation.samples_before)
+        for name, column in (columns | legend_parameters(block, *how)).items():
             values[name][good] = column
     return values
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
+from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeAlias
@@ -22,7 +23,6 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import lh5_rows, members, one_line, text_attribute, units_of
 from cpunet.outputs import refuse_existing, written_aside
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.columns import Column
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.units import factor
 
@@ -39,6 +39,7 @@ _CHUNK_BYTES = 1 << 18
 _GZIP_LEVEL = 1
 
 
+@dataclass(eq=False)
 class PulseWriter:
     """Writer of an LH5 file: append blocks of pulses, then leave the ``with`` block.
 
@@ -56,8 +57,6 @@ class PulseWriter:
         Path of the table in the file.
     waveform_units
         Units of the samples: ``"ADC"``, or ``""`` for units of the full charge.
-    t0_ns
-        Time of the first sample in ns.
     attrs
         Attributes of the table, such as the origin of the pulses.
     samples
@@ -82,31 +81,24 @@ class PulseWriter:
     [250.0, 300.0]
     """
 
-    def __init__(
-        self,
-        path: str | Path,
-        *,
-        table: str = "geds/sim",
-        waveform_units: str = "",
-        attrs: Mapping[str, str | float] | None = None,
-        samples: npt.DTypeLike = np.float32,
-        force: bool = False,
-    ) -> None:
-        self.path = Path(path)
-        self._samples = samples
-        self.n_pulses = 0
-        self._table = table.strip("/")
-        if not self._table:
-            raise CpunetError(f"{path}: the table has no name; give one such as geds/sim")
-        self._waveform_units = waveform_units
-        self._attrs = dict(attrs or {})
+    path: str | Path
+    _: KW_ONLY
+    table: str = "geds/sim"
+    waveform_units: str = ""
+    attrs: Mapping[str, str | float] | None = None
+    samples: npt.DTypeLike = np.float32
+    force: bool = False
+    n_pulses: int = field(default=0, init=False)
+
+    def __post_init__(self) -> None:
+        if not self.table.strip("/"):
+            raise CpunetError(f"{self.path}: the table has no name; give one such as geds/sim")
+        refuse_existing(Path(self.path), force=self.force)
         self._stack = ExitStack()
-        self._file: h5py.File  # within the writer's with block
-        self._held: HeldFile
-        refuse_existing(self.path, force=force)
 
     def __enter__(self) -> Self:
-        self._file, self._held = self._stack.enter_context(written_hdf5(self.path))
+        written = written_hdf5(Path(self.path))
+        self._file, self._held = self._stack.enter_context(written)
         return self
 
     def __exit__(self, *error: Any) -> None:
@@ -128,19 +120,34 @@ class PulseWriter:
         """
         if len(pulses) == 0:
             return
-        content: dict[str, LGDO] = {
-            "waveform": waveform_table(
-                pulses, units=self._waveform_units, samples=self._samples
-            ),
-            "energy": Array(pulses.energy_kev, attrs={"units": "keV"}),
-            "event_number": Array(pulses.event_number),
+        n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
+        values = ArrayOfEqualSizedArrays(
+            nda=pulses.waveforms.astype(self.samples, copy=False),
+            attrs={
+                # not called "units": dspeed copies that attribute to its table buffer, which
+                # the LH5 library then refuses to fill a second time
+                "sample_units": self.waveform_units,
+                "hdf5_settings": {
+                    "chunks": (n_rows, pulses.length),
+                    "compression": "gzip",
+                    "compression_opts": _GZIP_LEVEL,
+                    "shuffle": True,
+                },
+            },
+        )
+        times = {"t0": np.array(pulses.t0_ns), "dt": np.full(len(pulses), pulses.dt_ns)}
+        content: Columns = {
+            "waveform": WaveformTable(**times, t0_units="ns", dt_units="ns", values=values),
+            "energy": (pulses.energy_kev, "keV"),
+            "event_number": (pulses.event_number, ""),
         }
-        content |= {name: _column(column) for name, column in (columns or {}).items()}
-        self._write(Table(col_dict=content, attrs=dict(self._attrs)), self._table)
+        self.append_rows(self.table, {**content, **(columns or {})}, self.attrs)
         self.n_pulses += len(pulses)
 
-    def append_rows(self, table: str, columns: Columns) -> None:
-        """Append rows to another, flat table of the file, such as the hits of the events.
+    def append_rows(
+        self, table: str, columns: Columns, attrs: Mapping[str, str | float] | None = None
+    ) -> None:
+        """Append rows to another table of the file, such as the hits of the events.
 
         Parameters
         ----------
@@ -148,27 +155,30 @@ class PulseWriter:
             Path of the table in the file, for example ``"geds/hits"``.
         columns
             Name → (array of shape ``(rows,)``, units); the same names each time.
+        attrs
+            Attributes of the table.
         """
-        content = {key: _column(column) for key, column in columns.items()}
-        if len(next(iter(content.values()))) > 0:
-            self._write(Table(content), table.strip("/"))
-
-    def _write(self, rows: Table, table: str) -> None:
-        group, _, name = table.rpartition("/")
+        content = {
+            name: column
+            if isinstance(column, LGDO)
+            else _array(np.asarray(column[0]), column[1])
+            for name, column in columns.items()
+        }
+        if len(next(iter(content.values()))) == 0:
+            return
+        group, _, name = table.strip("/").rpartition("/")
+        rows = Table(col_dict=content, attrs=dict(attrs or {}))
         lh5.write(rows, name, self._file, group=group or "/", wo_mode="append")
         self._held.require_written()
 
     def annotate(self, name: str, text: str, *, file: bool = False) -> None:
         """Set an attribute of the table of pulses after the first block, or of the `file`."""
-        item = self._file if file else self._file[self._table]
+        item = self._file if file else self._file[self.table.strip("/")]
         item.attrs[name] = text
 
 
-def _column(column: tuple[npt.ArrayLike, str] | LGDO) -> LGDO:
-    if not isinstance(column, tuple):
-        return column
-    values, units = column
-    return Array(np.asarray(values), attrs={"units": units} if units else {})
+def _array(values: npt.NDArray[Any], units: str) -> Array:
+    return Array(values, attrs={"units": units} if units else {})
 
 
 class HeldFile(io.FileIO):
@@ -217,34 +227,6 @@ def written_hdf5(target: Path) -> Iterator[tuple[h5py.File, HeldFile]]:
             held.require_written()
 
 
-def waveform_table(
-    pulses: Pulses, *, units: str, samples: npt.DTypeLike = np.float32
-) -> WaveformTable:
-    """LH5 waveform table with the given sample type, in chunks of whole traces."""
-    n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
-    # not called "units": dspeed copies that attribute to its table buffer, which the LH5
-    # library then refuses to fill a second time
-    values = ArrayOfEqualSizedArrays(
-        nda=pulses.waveforms.astype(samples, copy=False),
-        attrs={
-            "sample_units": units,
-            "hdf5_settings": {
-                "chunks": (n_rows, pulses.length),
-                "compression": "gzip",
-                "compression_opts": _GZIP_LEVEL,
-                "shuffle": True,
-            },
-        },
-    )
-    return WaveformTable(
-        t0=np.array(pulses.t0_ns),
-        t0_units="ns",
-        dt=np.full(len(pulses), pulses.dt_ns),
-        dt_units="ns",
-        values=values,
-    )
-
-
 SUFFIX = "_source"  # appended to columns whose name the translation uses itself
 _NUMBERS = "iufb"
 
@@ -270,22 +252,24 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
         The reason for each column that cannot be copied.
     """
     readers, left_out = dict[str, Callable[[int, int], LGDO]](), dict[str, str]()
-    if (group := source.group) is None:
-        for name, column in source.columns.items():
-            if not _is_same(name, column.units, own):
-                readers[name] = partial(_of_column, column)
-    else:
-        waveforms, size = source.name.rpartition("/")[2], source.n_all or source.n_pulses or 0
-        with one_line(source.path):
-            for name, item in members(group).items():
-                is_plain = isinstance(item, h5py.Dataset)
-                units = units_of(item) if is_plain else ""
-                if name == waveforms or (is_plain and _is_same(name, units, own)):
-                    continue
-                if reason := _unreadable(item, size):
-                    left_out[name] = reason
-                else:
-                    readers[name] = partial(_rows, group[name], source.chosen)
+    chosen, n_rows = source.chosen, source.n_all or source.n_pulses or 0
+    with one_line(source.path):
+        if source.group is None:
+            columns = {name: (c.values, c.units) for name, c in source.columns.items()}
+            chosen, n_rows = None, source.n_pulses or 0
+        else:
+            waveforms = source.name.rpartition("/")[2]
+            items = members(source.group)
+            columns = {n: (item, units_of(item)) for n, item in items.items() if n != waveforms}
+        for name, (item, units) in columns.items():
+            in_kev = name == "energy" and factor(units, "keV") is not None
+            same = name in own and (name == "event_number" or in_kev)
+            if same and not isinstance(item, h5py.Group):
+                continue
+            if reason := _unreadable(item, n_rows):
+                left_out[name] = reason
+            else:
+                readers[name] = partial(_rows, item, units, chosen)
     shown, taken = {}, {*readers, *own}
     for name in readers:
         shown[name] = name
@@ -300,22 +284,20 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
     return read, left_out
 
 
-def _of_column(column: Column, start: int, n: int) -> LGDO:
-    return _column((column.read(start, start + n), column.units))
+def _is_lh5(item: Any) -> bool:
+    return not isinstance(item, np.ndarray) and text_attribute(item, "datatype") != ""
 
 
-def _rows(
-    item: h5py.Group | h5py.Dataset, chosen: npt.NDArray[Any] | None, start: int, n: int
-) -> LGDO:
+def _rows(item: Any, units: str, chosen: npt.NDArray[Any] | None, start: int, n: int) -> LGDO:
     """Rows from a first one on, of all or of some chosen ones, which ascend."""
     some = None if chosen is None else chosen[start : start + n]
-    if text_attribute(item, "datatype"):
+    if _is_lh5(item):
         return lh5_rows(item, 0 if some is not None else start, n, some)
-    attrs = {"units": units} if (units := units_of(item)) else {}
     if item.ndim == 0:
-        return Array(np.full(n, item[()]), attrs=attrs)
+        return _array(np.full(n, item[()]), units)
     part = slice(start, start + n) if some is None else slice(some[0], some[-1] + 1)
     rows: Any = item[part] if some is None else item[part][some - some[0]]
+    attrs = {"units": units} if units else {}
     if rows.ndim > 1:
         return ArrayOfEqualSizedArrays(nda=rows, attrs=attrs)
     if rows.dtype.kind == "O":
@@ -323,24 +305,18 @@ def _rows(
     return Array(rows, attrs=attrs)
 
 
-def _is_same(name: str, units: str, own: Collection[str]) -> bool:
-    """Whether a column has the same meaning as the output's column of that name."""
-    in_energy_units = name == "energy" and factor(units, "keV") is not None
-    return name in own and (name == "event_number" or in_energy_units)
-
-
-def _unreadable(item: h5py.Group | h5py.Dataset, n_pulses: int) -> str:
+def _unreadable(item: Any, n_pulses: int) -> str:
     """Reason why a column cannot be copied; empty if it can."""
-    if not text_attribute(item, "datatype"):
-        if not isinstance(item, h5py.Dataset):
-            return "a group that is no column"
-        if item.dtype.kind not in _NUMBERS and not h5py.check_string_dtype(item.dtype):
-            return f"of type {item.dtype}"
-        rows = n_pulses if item.ndim == 0 else item.shape[0]
-    else:
+    if _is_lh5(item):
         try:
             rows = lh5.read_n_rows(item.name, item.file)
-            _rows(item, None, 0, 1)
+            _rows(item, "", None, 0, 1)
         except Exception as error:  # the library raises various errors on foreign types
             return f"the LH5 library cannot read it ({' '.join(str(error).split())})"
+    elif isinstance(item, h5py.Group):
+        return "a group that is no column"
+    elif item.dtype.kind not in _NUMBERS and not h5py.check_string_dtype(item.dtype):
+        return f"of type {item.dtype}"
+    else:
+        rows = n_pulses if item.ndim == 0 else item.shape[0]
     return "" if rows == n_pulses else f"{rows} rows for {n_pulses} pulses"

@@ -101,7 +101,7 @@ class Translation:
             return self.in_memory.codes
         assert self.path is not None
         column = open_pulses(self.path).columns["rejection"]
-        return np.asarray(column.read(0, len(column)), np.uint8)
+        return np.asarray(column.values, np.uint8)
 
     @property
     def waveforms(self) -> FloatArray:

@@ -14,7 +14,6 @@ from __future__ import annotations
 import pickle
 import zipfile
 import zlib
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -65,11 +64,8 @@ def read_memory(options: PulseFile) -> PulseSource:
     """Pulses in memory."""
     pulses = options.pulses
     assert pulses is not None  # which are read in place of a file
-    columns = {
-        "energy_kev": Column.of(pulses.energy_kev),
-        "event_number": Column.of(pulses.event_number),
-        "dt_ns": Column.of(np.array(pulses.dt_ns)),
-    }
+    names = ("energy_kev", "event_number", "dt_ns")
+    columns = {name: Column.of(np.asarray(getattr(pulses, name))) for name in names}
     return PulseSource.of_array(options.path, "memory", "", pulses.waveforms, columns)
 
 
@@ -84,8 +80,8 @@ def read_numpy(options: PulseFile) -> PulseSource:
     matrices = [name for name, values in arrays.items() if values.ndim == 2]
     if not matrices:
         raise CpunetError(
-            f"{options.path}: no waveforms in it; it holds {shortened(arrays)}; "
-            "give an array of two dimensions (event, sample)"
+            f"{options.path}: no waveforms in it; it holds {shortened(arrays)}",
+            "give an array of two dimensions (event, sample)",
         )
     usual = [name for name in _WAVEFORMS if name in matrices and options.place is None]
     name = options.chosen_of(usual or matrices, "array", "arrays of two dimensions")
@@ -96,8 +92,9 @@ def read_numpy(options: PulseFile) -> PulseSource:
     columns = {
         column: Column.of(values.ravel() if values.ndim else values)
         for column, values in arrays.items()
-        if (values.ndim <= 1 or (1 in values.shape and column != name))
+        if (values.ndim <= 1 or 1 in values.shape)
         and values.dtype.kind in "iufb"
+        and column != name
     }
     return PulseSource.of_array(options.path, "NumPy", name, arrays[name], columns)
 
@@ -137,10 +134,22 @@ def read_pickles(options: PulseFile) -> PulseSource:
     path = options.path
     if options.table is not None:
         raise CpunetError(f"{path}: a file of pickled pulses has no tables; leave out `table`")
-    traces: list[npt.NDArray[np.float32]] = []
-    events: list[int] = []
-    numbers: list[dict[str, float]] = []
-    for place, entry in enumerate(_entries(path)):
+    entries = list[Any]()
+    with path.open("rb") as stream:
+        while stream.peek(1):
+            try:
+                value = _Unpickler(stream).load()
+            except CpunetError as error:
+                raise CpunetError(f"{path}: {error}") from error
+            except Exception as error:  # a damaged pickle can raise anything
+                raise CpunetError(
+                    f"{path}: breaks off after {len(entries)} entries "
+                    f"({' '.join(str(error).split())}); download it again"
+                ) from error
+            entries += value if isinstance(value, list | tuple) else [value]
+    traces, events = list[npt.NDArray[np.float32]](), list[int]()
+    numbers = list[dict[str, float]]()
+    for place, entry in enumerate(entries):
         try:
             with np.errstate(over="ignore"):  # values beyond single precision are counted later
                 trace = np.asarray(entry["wf"], np.float32)
@@ -163,25 +172,6 @@ def read_pickles(options: PulseFile) -> PulseSource:
         columns[name] = Column.of(values, "keV" if name == "energy" else "")
     waveforms = np.stack(traces) if traces else np.empty((0, 0), np.float32)
     return PulseSource.of_array(path, "pickled pulses", "", waveforms, columns)
-
-
-def _entries(path: Path) -> Iterator[Any]:
-    """Yield the objects pickled one after the other in a file, and the items of lists."""
-    n_read = 0
-    with path.open("rb") as stream:
-        while stream.peek(1):
-            try:
-                value = _Unpickler(stream).load()
-            except CpunetError as error:
-                raise CpunetError(f"{path}: {error}") from error
-            except Exception as error:  # a damaged pickle can raise anything
-                said = " ".join(str(error).split())
-                raise CpunetError(
-                    f"{path}: breaks off after {n_read} entries ({said}); download it again"
-                ) from error
-            some = value if isinstance(value, list | tuple) else [value]
-            n_read += len(some)
-            yield from some
 
 
 READERS = {"memory": read_memory, "NumPy": read_numpy, "pickle": read_pickles}

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
-from functools import partial, reduce
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from functools import cached_property, reduce
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -27,68 +26,50 @@ _DIVIDES = re.compile(
     rf"{_NUMBERED}?|(?:raw|vol|copy|rep|fc|daq){_NUMBERED}|irep",
     re.IGNORECASE,
 )
+# Columns by which the rows of two files are joined; the last is no number of an event.
+EVENT_KEYS = ("event_number", "eventnumber", "evtid", "ievt", "timestamp")
 _MOST, _FEWEST = 512, 2  # channels of an experiment, and rows of each on average
 _MAX_NUMBER = 2.0**62
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Column:
-    """One value per event, or a single value that applies to all events.
+    """One value per event, or a single number that applies to all events.
 
     Parameters
     ----------
-    read
-        Gives the values of the events from a first one to the one before a last.
+    load
+        Gives the values, of no dimension if they are a number that applies to all.
     size
         Number of values.
     units
         Units in the file, ``""`` if there are none.
-    constant
-        Whether a single value applies to all events.
     """
 
-    read: Read
+    load: Callable[[], npt.NDArray[Any]]
     size: int
     units: str = ""
-    constant: bool = False
 
     @classmethod
-    def of(cls, values: npt.NDArray[Any], units: str = "") -> Self:
-        """A column in memory; a scalar applies to all events."""
-        if values.ndim == 0:
-            return cls(lambda start, stop: np.full(stop - start, values), 1, units, True)
-        return cls(lambda start, stop: values[start:stop], len(values), units)
+    def of(cls, values: npt.NDArray[Any], units: str = "") -> Column:
+        """A column in memory."""
+        return cls(lambda: values, values.size, units)
 
-    def __len__(self) -> int:
-        return self.size
+    @cached_property
+    def values(self) -> npt.NDArray[Any]:
+        """All values, which are read when they are asked for."""
+        return self.load()
 
-    def at(self, rows: npt.NDArray[np.int64]) -> Self:
-        """The values of some rows, which ascend; a value for all stays."""
-        if self.constant or len(self) == 1:
-            return self
-        return replace(self, read=partial(some_of, self.read, rows), size=len(rows))
-
-    def to(self, unit: str) -> Self | None:
+    def to(self, unit: str) -> npt.NDArray[np.float64] | None:
         """The values in ns or keV, see `cpunet.units`; None if they are in no such units."""
         by = factor(self.units, unit)
-        return None if by is None else self.times(by, unit)
+        return None if by is None else by * np.asarray(self.values, np.float64)
 
-    def times(self, by: float, units: str) -> Self:
-        """The values times a factor, in other units."""
-        read = self.read
-        return replace(
-            self,
-            read=lambda start, stop: by * np.asarray(read(start, stop), np.float64),
-            units=units,
-        )
-
-    def require_length(self, path: Path, name: str, n_pulses: int | None) -> None:
-        """Raise a `CpunetError` unless it has a value for each pulse, or one for all."""
-        if n_pulses is not None and not self.constant and len(self) != n_pulses:
-            raise CpunetError(
-                f"{path}: column {name} has {len(self)} values for {n_pulses} waveforms; "
-                "give the column of the same events"
-            )
+    def at(self, rows: npt.NDArray[np.int64], n: int | None) -> Column:
+        """The values of some of `n` rows; a number for all stays."""
+        if self.size != n:
+            return self
+        return Column(lambda: self.values[rows], len(rows), self.units)
 
 
 def some_of(read: Read, rows: npt.NDArray[np.int64], start: int, stop: int) -> npt.NDArray[Any]:

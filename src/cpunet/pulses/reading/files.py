@@ -187,18 +187,15 @@ class PulseFile:
         CpunetError
             If there is no such table, or there are several and none was chosen.
         """
-        if self.place is None:
-            if len(tables) == 1:
-                return tables[0]
-            raise CpunetError(
-                f"{self.path}: {len(tables)} {kinds} ({shortened(tables)})",
-                "choose one with `table` (`sim_table`, `data_table`)",
-            )
-        if self.place not in tables:
-            raise CpunetError(
-                f"{self.path}: no {kind} {self.place}; there are {shortened(tables)}"
-            )
-        return self.place
+        place = tables[0] if self.place is None and len(tables) == 1 else self.place
+        if place in tables:
+            return place
+        if place is not None:
+            raise CpunetError(f"{self.path}: no {kind} {place}; there are {shortened(tables)}")
+        raise CpunetError(
+            f"{self.path}: {len(tables)} {kinds} ({shortened(tables)})",
+            "choose one with `table` (`sim_table`, `data_table`)",
+        )
 
     def open(self) -> PulseSource:
         """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
@@ -213,12 +210,7 @@ class PulseFile:
             from cpunet.pulses.reading import arrays
 
             read = arrays.READERS[format_]
-        source = read(self)
-        try:
-            return source.resolved(self)
-        except BaseException:
-            source.close()
-            raise
+        return read(self).resolve(self)
 
 
 Source: TypeAlias = str | Path | PulseFile | Pulses

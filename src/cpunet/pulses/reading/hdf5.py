@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeGuard
@@ -32,7 +30,7 @@ from cpunet.hdf5_files import (
     texts_of,
     units_of,
 )
-from cpunet.pulses.reading.columns import Column, divides, dividing, labels
+from cpunet.pulses.reading.columns import EVENT_KEYS, Column, divides, dividing, labels
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource
 from cpunet.tables import shortened
@@ -41,24 +39,27 @@ from cpunet.tables import shortened
 _PREFERRED = ("waveform", "waveform_windowed")
 log = logging.getLogger(__name__)
 
+_Folder = tuple[str, dict[str, h5py.Group | h5py.Dataset], list[str], list[str]]
+
 # plain datasets, in order of preference
 _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
 
 
 def read_hdf5(options: PulseFile) -> PulseSource:
     """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
-    path = options.path
-    with one_line(path), ExitStack() as unless_read:
-        file = unless_read.enter_context(open_hdf5(path))
+    path, file = options.path, open_hdf5(options.path)
+    with one_line(path):
         name = choose_waveforms(path, file, options.place)
         table, _, own_name = name.rpartition("/")
         group, values = file[table or "/"], file[name]
         columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
+        of_file = {"attrs": attrs, "group": group, "close": file.close}
         if isinstance(values, h5py.Dataset):
             columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
-            plain = PulseSource.of_array(path, "HDF5", name, values, columns, attrs)
-            rows = reading(path, values, plain.rows)
-            return replace(plain, rows=rows, group=group, close=unless_read.pop_all().close)
+            rows = reading(path, values, lambda start, stop: np.asarray(values[start:stop]))
+            return PulseSource.of_array(
+                path, "HDF5", name, values, columns, rows=rows, **of_file
+            )
         own, values = columns_of(path, values), values["values"]
         # a group holds the traces encoded, or as vectors of their own lengths
         is_group, sized = isinstance(values, h5py.Group), values
@@ -66,19 +67,19 @@ def read_hdf5(options: PulseFile) -> PulseSource:
             sized = values.get("encoded_data", values).get("cumulative_length")
         n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
         first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
-        shortest, longest = first.shape[1:] * 2
-        if n and is_group and "cumulative_length" in values:
+        longest = first.shape[1]
+        if n and is_group and "cumulative_length" in values and first.dtype.kind == "f":
             lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
-            shortest, longest = int(lengths.min()), int(lengths.max())
-        if shortest < longest and first.dtype.kind == "f":
-            log.info(
-                f"{path.name}: pulses of {shortest} to {longest} samples are continued with "
-                "their last value"
-            )
+            longest = int(lengths.max())
+            if lengths.min() < longest:
+                log.info(
+                    f"{path.name}: pulses of {lengths.min()} to {longest} samples are "
+                    "continued with their last value"
+                )
         rows = reading(path, values, partial(_lh5_traces, values, longest))
         return PulseSource(
-            path, "LH5", name, n, longest, rows, columns, attrs, f"{name}/dt", own.get("dt"),
-            t0=own.get("t0"), group=group, close=unless_read.pop_all().close,
+            path, "LH5", name, n, longest, rows, columns, period_name=f"{name}/dt",
+            period=own.get("dt"), t0=own.get("t0"), **of_file,
         )  # fmt: skip
 
 
@@ -129,9 +130,9 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     if _is_lh5(item) or _is_array(item):
         return place
     folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
-    for broken in (link for folder in folders for link in folder.broken):
-        item_at(file, broken)  # which says what is wrong
-    columns = [column for folder in folders for column in folder.waveforms]
+    for link in (link for *_, broken in folders for link in broken):
+        item_at(file, link)  # which says what is wrong
+    columns = [column for _, _, waveforms, _ in folders for column in waveforms]
     if len(columns) == 1:
         return columns[0]
     if not columns:
@@ -157,12 +158,12 @@ def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
     if place and (tables := waveform_tables(file)):
         return CpunetError(f"{path}: no waveforms in {place}; they are in {shortened(tables)}")
     held: dict[str, int] = {}
-    for folder in _folders(file):
-        for name, item in folder.members.items():
+    for folder, items, _, _ in _folders(file):
+        for name, item in items.items():
             if isinstance(item, h5py.Dataset) and item.shape:
                 what = h5py.check_vlen_dtype(item.dtype) or item.dtype
                 size = item.dtype.itemsize * int(np.prod(item.shape[1:]))
-                held[f"{folder.path}/{name}".strip("/") + f" {item.shape} of {what}"] = size
+                held[f"{folder}/{name}".strip("/") + f" {item.shape} of {what}"] = size
     listed = sorted(held, key=lambda name: -held[name]) or list(file)
     return CpunetError(
         f"{path}: no waveforms in it; it holds {shortened(listed)}",
@@ -177,13 +178,10 @@ def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
 
 def waveform_tables(file: h5py.File) -> list[str]:
     """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
-    return sorted(
-        {
-            place
-            for f in _folders(file)
-            for place in f.broken or ([f.path] if f.waveforms else [])
-        }
-    )
+    tables = set[str]()
+    for path, _, waveforms, broken in _folders(file):
+        tables.update(broken or ([path] if waveforms else []))
+    return sorted(tables)
 
 
 def channel_tables(path: Path, file: h5py.File) -> list[str]:
@@ -195,31 +193,23 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
             columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         except CpunetError:  # said where the table is opened
             columns = {}
-        rows = max(map(len, columns.values()), default=0)
-        of = {n: c.read(0, rows) for n, c in columns.items() if divides(n) and len(c) == rows}
+        rows = max((column.size for column in columns.values()), default=0)
+        whole = {n: c for n, c in columns.items() if divides(n) and c.size == rows}
+        of = {name: np.atleast_1d(column.values) for name, column in whole.items()}
         names = dividing(of, rows)
         parts = np.unique(labels(of, names)) if names else [""]
         channels += [f"{table}/{part}".strip("/") for part in parts]
     return channels
 
 
-@dataclass(frozen=True)
-class _Folder:
-    """A group of a file: its path, what it holds, waveforms in it, and links that lead nowhere.
-
-    The waveforms are those of LH5, or else the first of the usual names.
-    """
-
-    path: str
-    members: dict[str, h5py.Group | h5py.Dataset]
-    waveforms: list[str]
-    broken: list[str]
-
-
 def _folders(
     group: h5py.Group, path: str = "", seen: set[tuple[int, int]] | None = None
 ) -> Iterator[_Folder]:
-    """A group and those in it, except in tables, through links."""
+    """A group and those in it, except in tables, through links.
+
+    Of each: its path, what it holds, paths of waveforms in it, and of links that lead nowhere.
+    The waveforms are those of LH5, or else the first of the usual names.
+    """
     # links can give an object several names or form cycles: visit each object once
     seen, info = set() if seen is None else seen, h5py.h5o.get_info(group.id)
     if (info.fileno, info.addr) in seen:
@@ -238,7 +228,7 @@ def _folders(
         names = []  # the inside of waveforms
     of = f"{path}/".lstrip("/")
     lost = [] if names or is_table else [of + name for name in broken]
-    yield _Folder(path, items, [of + name for name in names], lost)
+    yield path, items, [of + name for name in names], lost
     for name, item in items.items():
         # columns of a table can be groups of many datasets, but contain no waveforms
         if isinstance(item, h5py.Group) and not is_table:
@@ -253,39 +243,58 @@ def _is_lh5(item: object) -> bool:
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numbers, and texts where they separate channels."""
+
+    def load(item: h5py.Dataset) -> npt.NDArray[Any]:
+        with one_line(path):
+            values = np.asarray(item[()])
+        return values.ravel() if values.ndim else values
+
     columns = {}
     for name, item in members(group).items():
         # MATLAB has no vectors, but writes a row
         is_number = is_column(item) or (_is_array(item) and 1 in item.shape)
         is_text = isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
         if is_number or (is_text and divides(name)):
-            columns[name] = _stored(path, item)
+            columns[name] = Column(partial(load, item), item.size, units_of(item))
     return columns
 
 
-def _stored(path: Path, dataset: h5py.Dataset) -> Column:
-    """A dataset as a column."""
-    if dataset.ndim != 1:  # a number, or a row of MATLAB's
-        values = np.asarray(dataset[()])
-        return Column.of(values.ravel() if dataset.ndim else values, units_of(dataset))
-    read = reading(path, dataset, lambda start, stop: np.asarray(dataset[start:stop]))
-    return Column(read, dataset.size, units_of(dataset))
-
-
-def column_of(path: Path, name: str) -> tuple[Column, dict[str, Column]]:
-    """Return a column of an HDF5 file by its path in the file, and all columns of its group.
+def column_elsewhere(source: PulseSource, column: str) -> Column:
+    """``FILE:path/to/column`` in the order of the pulses, if both tell of which events.
 
     Raises
     ------
     CpunetError
-        If there is no such file or column; the message lists the other columns of the group.
+        If there is no such file or column, or it is of other events.
     """
+    path, place = Path(column.rpartition(":")[0]), column.rpartition(":")[2].strip("/")
+    folder, _, own = place.rpartition("/")
     file = open_hdf5(path)
-    place, _, own = name.strip("/").rpartition("/")
     with one_line(path):
-        group = item_at(file, place)
+        group = item_at(file, folder)
         columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
-        if own in columns:
-            return columns[own], columns
         names = list(columns or file)
-    raise CpunetError(f"{path}: no column {name}; there are {shortened(names)}")
+    if own not in columns:
+        raise CpunetError(f"{path}: no column {place}; there are {shortened(names)}")
+    if source.chosen is not None and columns[own].size == source.n_all:
+        columns = {name: c.at(source.chosen, source.n_all) for name, c in columns.items()}
+    theirs, wanted = columns[own], source.columns
+    key = next((k for k in EVENT_KEYS if k in wanted and k in columns), None)
+    if key is None or not wanted[key].values.ndim or columns[key].size != theirs.size:
+        return theirs
+    events, others = wanted[key].values, columns[key].values
+    if np.array_equal(events, others):
+        return theirs
+    _, at, of = np.intersect1d(events, others, return_indices=True)
+    if not len(at) or any(len(np.unique(keys)) < len(keys) for keys in (events, others)):
+        raise CpunetError(
+            f"{source.path}: {column} is of other events than these pulses ({key})",
+            "give the energies of the same events",
+        )
+    log.info(
+        f"{source.path.name}: {column} is in another order or of other events; joined by "
+        f"{key}, {len(events) - len(at)} of {len(events)} pulses have no energy there"
+    )
+    values = np.full(len(events), np.nan)
+    values[at] = np.asarray(theirs.values, float)[of]
+    return Column.of(values, theirs.units)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import re
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.columns import (
+    EVENT_KEYS,
     Column,
     divides,
     dividing,
@@ -39,8 +40,6 @@ log = logging.getLogger(__name__)
 BLOCK_BYTES = 1 << 28  # maximum size of a block of float32 traces
 ANY = "*"  # value of a column that separates no channels
 
-# Columns by which the rows of two files are joined; the last is no number of an event.
-EVENT_KEYS = ("event_number", "eventnumber", "evtid", "ievt", "timestamp")
 _USUAL = ("energy_kev", "energy_keV", "energy", "energy_label")
 # LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units, the
 # release of the Majorana Demonstrator `energy_label`.
@@ -66,14 +65,17 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
         return np.asarray(waveforms.max(axis=1) - baseline)
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class PulseSource:
+Values = npt.NDArray[Any]
+
+
+@dataclass(eq=False, repr=False)
+class PulseSource(AbstractContextManager["PulseSource"]):
     """Pulses of an open file: iterate over its `blocks`, or `read` it as a whole.
 
-    The reader of a format gives the content, and `resolved` the sampling period and the
+    The reader of a format gives the content, and `resolve` the sampling period and the
     energies.  The file is closed at the end of a ``with``, or with the last reference to this.
-    The memory in use does not grow with the file, except for ``.npz`` and pickles, which are
-    read as a whole.
+    The memory in use does not grow with the traces of a file, except for ``.npz`` and pickles,
+    which are read as a whole.
 
     Parameters
     ----------
@@ -92,24 +94,28 @@ class PulseSource:
         Columns with one value per trace, by name.
     attrs
         What the file says about the traces: side, maker, detector.
-    period_name
-        Name of the column of the sampling period.
-    period
-        Sampling period, if it is in the file.
+    period_name, period
+        Name and column of the sampling period, if it is in the file.
     t0
         Times of the first samples, if they are in the file.
     numbers
         Gives the event numbers of the traces read last, if the file has any.
     group, close
         Group of an HDF5 file with columns of any kind; closes the file.
+
+    Attributes
+    ----------
     chosen, n_all
         Rows of the table that are read, and how many it has; None if all are.
     dt_ns
-        Sampling period in ns; then `period` is that of each trace in ns, or None.
+        Sampling period in ns.
     energies
         The rule that gives each pulse its energy, in words.
-    energy, kev_per_adc
-        Energies in keV; without them, the factor from the amplitude, or unknown without that.
+    kev_per_adc
+        The factor from the amplitude to the energy, if there are no energies.
+    of_each
+        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
+        ``t0_ns``, and ``dt_ns`` if there are several.
     """
 
     path: Path
@@ -118,7 +124,7 @@ class PulseSource:
     n_pulses: int | None
     length: int
     rows: Read
-    columns: Mapping[str, Column] = field(default_factory=dict)
+    columns: dict[str, Column] = field(default_factory=dict)
     attrs: Mapping[str, str] = field(default_factory=dict)
     period_name: str = "dt"
     period: Column | None = None
@@ -126,12 +132,12 @@ class PulseSource:
     numbers: Read | None = None
     group: h5py.Group | None = None
     close: Callable[[], None] = lambda: None
-    chosen: npt.NDArray[np.int64] | None = None
-    n_all: int | None = None
-    dt_ns: float = np.nan
-    energies: str = ""
-    energy: Column | None = None
-    kev_per_adc: float | None = None
+    chosen: npt.NDArray[np.int64] | None = field(default=None, init=False)
+    n_all: int | None = field(default=None, init=False)
+    dt_ns: float = field(default=np.nan, init=False)
+    energies: str = field(default="", init=False)
+    kev_per_adc: float | None = field(default=None, init=False)
+    of_each: dict[str, Values] = field(default_factory=dict, init=False)
 
     @classmethod
     def of_array(
@@ -140,8 +146,8 @@ class PulseSource:
         format: str,
         name: str,
         values: Any,
-        columns: Mapping[str, Column],
-        attrs: Mapping[str, str] = MappingProxyType({}),
+        columns: dict[str, Column],
+        **how: Any,
     ) -> PulseSource:
         """An array, in memory or stored, of shape ``(traces, samples)``, and its columns.
 
@@ -152,32 +158,24 @@ class PulseSource:
             with their dimensions reversed.
         """
         n, length = values.shape
-        sizes = {len(column) for column in columns.values() if not column.constant}
+        sizes = {column.size for column in columns.values()}
         if length in sizes and n not in sizes:
             raise CpunetError(
                 f"{path}: traces of shape {values.shape} with columns of {length}: their "
                 "dimensions are reversed",
                 "write them transposed, with the pulses first",
             )
-        period_name, period = "dt", columns.get("dt")
+        how = {
+            "rows": lambda start, stop: values[start:stop],
+            "period": columns.get("dt"),
+        } | how
         if (in_ns := columns.get("dt_ns")) is not None:
-            period_name, period = "dt_ns", replace(in_ns, units=in_ns.units or "ns")
-        return cls(
-            path, format, name, n, length, lambda start, stop: values[start:stop], columns,
-            attrs, period_name, period,
-        )  # fmt: skip
+            period = Column(in_ns.load, in_ns.size, in_ns.units or "ns")
+            how |= {"period_name": "dt_ns", "period": period}
+        return cls(path, format, name, n, length, columns=columns, **how)
 
-    def at(self, rows: npt.NDArray[np.int64]) -> PulseSource:
-        """Some rows, which ascend."""
-        period, t0 = (c and c.at(rows) for c in (self.period, self.t0))
-        return replace(
-            self, n_pulses=len(rows), rows=partial(some_of, self.rows, rows), period=period,
-            t0=t0, columns={n: c.at(rows) for n, c in self.columns.items()},
-            chosen=rows, n_all=self.n_pulses,
-        )  # fmt: skip
-
-    def resolved(self, file: PulseFile) -> PulseSource:
-        """With the rows, the sampling period and the energies that the user chose.
+    def resolve(self, file: PulseFile) -> Self:
+        """Take the rows, the sampling period and the energies that the user chose.
 
         Raises
         ------
@@ -189,39 +187,45 @@ class PulseSource:
                 f"{self.path}: {self.name or self.format} holds no pulses; "
                 "give a file with events"
             )
-        of_channel = self._of_channel(file.rows)
-        columns, t0, numbers = of_channel.columns, of_channel.t0, of_channel.numbers
-        dt_ns, period = _sampling(of_channel, file.dt_ns)
-        energies, energy = _energies(of_channel, file.energy, file.kev_per_adc)
-        if name := next((name for name in EVENT_KEYS[:-1] if name in columns), None):
-            columns[name].require_length(self.path, name, of_channel.n_pulses)
-            numbers = columns[name].read
-        return replace(
-            of_channel, dt_ns=dt_ns, period=period, t0=None if t0 is None else t0.to("ns"),
-            numbers=numbers, energies=energies, energy=energy, kev_per_adc=file.kev_per_adc,
-        )  # fmt: skip
+        if self.n_pulses is not None:
+            self._choose(file.rows, self.n_pulses)
+        self._sample(file.dt_ns)
+        self._calibrate(file.energy, file.kev_per_adc)
+        if self.t0 is not None and (t0_ns := self.t0.to("ns")) is not None:
+            self.of_each["t0_ns"] = np.broadcast_to(t0_ns, (self.n_pulses or 0,))
+        if name := next((name for name in EVENT_KEYS[:-1] if name in self.columns), None):
+            self.of_each["event_number"] = self._of_each(name, self.columns[name])
+        return self
 
-    def _of_channel(self, chosen: Mapping[str, str]) -> PulseSource:
-        """Rows with the chosen values of some columns, or all if they are of one channel."""
-        if self.n_pulses is None:
-            return self
-        whole = {n: c for n, c in self.columns.items() if len(c) == self.n_pulses}
-        rows = np.arange(self.n_pulses)
-        for name, value in chosen.items():
+    def _of_each(self, name: str, column: Column) -> Values:
+        """Values of a column, which must be as many as there are traces, or one for all."""
+        values, n = column.values, self.n_pulses
+        if n is not None and values.shape not in ((), (n,)):
+            raise CpunetError(
+                f"{self.path}: column {name} has {len(values)} values for {n} waveforms; "
+                "give the column of the same events"
+            )
+        return np.atleast_1d(values) if n is None else np.broadcast_to(values, (n,))
+
+    def _choose(self, wanted: Mapping[str, str], n: int) -> None:
+        """Choose rows by values of some columns; all must be of one channel."""
+        whole = {name: c for name, c in self.columns.items() if c.size == n}
+        rows = np.arange(n)
+        for name, value in wanted.items():
             if value == ANY:
                 continue
             if name not in whole:
                 raise CpunetError(
                     f"{self.path}: no column {name}; there are {shortened(whole)}"
                 )
-            values = texts(whole[name].read(0, self.n_pulses))
+            values = texts(np.atleast_1d(whole[name].values))
             rows = rows[values[rows] == value]
             if not len(rows):
                 raise CpunetError(
                     f"{self.path}: no {name} {value}; it holds {shortened(np.unique(values))}"
                 )
-        of = {n: c.read(0, self.n_pulses)[rows] for n, c in whole.items() if divides(n)}
-        of = {name: values for name, values in of.items() if name not in chosen}
+        dividers = [name for name in whole if divides(name) and name not in wanted]
+        of = {name: np.atleast_1d(whole[name].values)[rows] for name in dividers}
         if names := dividing(of, len(rows)):
             channels = list(np.unique(labels(of, names)))
             also = ", or all for each" if self.format in ("LH5", "HDF5") else ""
@@ -231,10 +235,91 @@ class PulseSource:
                 f"choose one with `table` {channels[0]} (`sim_table`, `data_table`){also}; "
                 f"{','.join(f'{name}={ANY}' for name in names)} takes them as one",
             )
-        return self if len(rows) == self.n_pulses else self.at(rows)
+        if len(rows) == n:
+            return
+        self.chosen, self.n_all, self.n_pulses = rows, n, len(rows)
+        self.rows = partial(some_of, self.rows, rows)
+        self.columns = {name: column.at(rows, n) for name, column in self.columns.items()}
+        self.period, self.t0 = (c and c.at(rows, n) for c in (self.period, self.t0))
 
-    def __enter__(self) -> Self:
-        return self
+    def _sample(self, dt_ns: float | None) -> None:
+        """Take the period from the column of the file or from the user.
+
+        A column without units is not used, and ``dt_ns`` is required.  A file that says
+        another period than the user is corrected, with a warning.
+        """
+        name, column = self.period_name, self.period
+        periods = None if column is None else column.to("ns")
+        if column is None or periods is None:
+            why = "is not in the file" if column is None else f"({name}) has no units"
+            if column is not None and column.units:
+                why = f"({name}) is in {column.units!r}, not in one of {unit_names('ns')}"
+            if dt_ns is None:
+                raise CpunetError(f"{self.path}: the sampling period {why}; give `dt_ns`")
+            self.dt_ns = dt_ns
+            return
+        if column.size != 1:
+            self._of_each(name, column)
+        self.dt_ns = period = float(periods.flat[0])
+        is_period = np.isfinite(period) and period > 0
+        if dt_ns is None and not is_period:
+            raise CpunetError(
+                f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns",
+                "give `dt_ns`",
+            )
+        if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
+            log.warning(
+                f"{self.path.name}: says that it is sampled every {period:g} ns; taken as "
+                f"{dt_ns:g} ns, as given (`dt_ns`)"
+            )
+            self.dt_ns = dt_ns
+        if column.size > 1 and is_period:  # a single value applies to all events
+            self.of_each["dt_ns"] = periods * (self.dt_ns / period)
+
+    def _calibrate(self, energy: str | None, kev_per_adc: float | None) -> None:
+        """Take the energies in keV from a column, and say by which rule.
+
+        Without ``energy``, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if
+        it is in energy units or ``kev_per_adc`` is given.  Otherwise the energy is the
+        amplitude times ``kev_per_adc``, or unknown without it.  ``energy`` names another
+        column, or ``FILE:path/to/column``.  Energies in units that are wrong or a little off
+        are multiplied by ``kev_per_adc`` as well, with a warning.
+        """
+        self.kev_per_adc, why = kev_per_adc, ""
+        if name := energy or next((name for name in _USUAL if name in self.columns), ""):
+            if (column := self.columns.get(name)) is None:
+                if ":" not in name:
+                    raise CpunetError(
+                        f"{self.path}: no column {name} for the energy; there are "
+                        f"{shortened(self.columns)}"
+                    )
+                from cpunet.pulses.reading import hdf5  # which other formats do not need
+
+                column = hdf5.column_elsewhere(self, name)
+            units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
+            by, rule = factor(units, "keV"), f"column {name} [{units}]"
+            if by is None and kev_per_adc is not None:
+                by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
+            elif by is not None and kev_per_adc is not None:
+                log.warning(
+                    f"{self.path.name}: column {name} is in {units}; its energies are "
+                    f"multiplied by {kev_per_adc:g}, as given (`kev_per_adc`)"
+                )
+                by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
+            if by is not None:
+                values = np.asarray(self._of_each(name, column), np.float64)
+                self.energies, self.of_each["energy_kev"] = rule, by * values
+                return
+            if energy is not None:
+                units = f"in {column.units}" if column.units else "without units"
+                raise CpunetError(
+                    f"{self.path}: column {name} is {units}, no energy in keV; "
+                    "add `kev_per_adc` (1 if it is in keV)"
+                )
+            why = f" (column {name} is not in energy units)"
+        self.energies = f"not known{why}"
+        if kev_per_adc is not None:
+            self.energies = f"amplitude x {kev_per_adc:g} keV/ADC"
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -259,10 +344,9 @@ class PulseSource:
             start += len(traces)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
-        column = self.energy
-        if column is not None and not column.constant and len(column) != start:
+        if (energies := len(self.of_each.get("energy_kev", range(start)))) != start:
             raise CpunetError(
-                f"{self.path}: {start} waveforms, but {len(column)} energies; "
+                f"{self.path}: {start} waveforms, but {energies} energies; "
                 "give the energies of the same events"
             )
 
@@ -277,11 +361,12 @@ class PulseSource:
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(traces, np.float32)
         n, stop = len(waveforms), start + len(waveforms)
-        numbers = np.arange(start, stop) if self.numbers is None else self.numbers(start, stop)
-        energy_kev, t0_ns = np.full(n, np.nan), np.zeros(n)
-        if self.energy is not None:
-            energy_kev = self.energy.read(start, stop)
-        elif self.kev_per_adc is not None:
+        of_each = {name: values[start:stop] for name, values in self.of_each.items()}
+        numbers = of_each.get("event_number", np.arange(start, stop))
+        if self.numbers is not None:
+            numbers = self.numbers(start, stop)
+        energy_kev = of_each.get("energy_kev", np.full(n, np.nan))
+        if "energy_kev" not in of_each and self.kev_per_adc is not None:
             energy_kev = self.kev_per_adc * amplitude(waveforms)
         if len(energy_kev) != n:
             raise CpunetError(
@@ -289,129 +374,19 @@ class PulseSource:
                 "give the energies of the same events"
             )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
-        if self.period is not None:
-            periods = self.period.read(start, stop)
-            other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
-            if other.any():
-                first = int(other.argmax())
-                raise CpunetError(
-                    f"{self.path}: event {event_number[first]}: sampling period "
-                    f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
-                    "split the file by sampling period"
-                )
-        if self.t0 is not None:
-            t0_ns = self.t0.read(start, stop)
-        return Pulses.of(
-            waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number,
-            t0_ns=t0_ns,
-        )  # fmt: skip
-
-
-def _sampling(source: PulseSource, dt_ns: float | None) -> tuple[float, Column | None]:
-    """The period in ns from the column of the file or from the user, and that of each trace.
-
-    A column without units is not used, and ``dt_ns`` is required.  A file that says another
-    period than the user is corrected, with a warning.
-    """
-    path, name, column = source.path, source.period_name, source.period
-    in_ns = None if column is None else column.to("ns")
-    if column is None or in_ns is None:
-        if dt_ns is not None:
-            return dt_ns, None
-        why = "is not in the file" if column is None else f"({name}) has no units"
-        if column is not None and column.units:
-            why = f"({name}) is in {column.units!r}, not in one of {unit_names('ns')}"
-        raise CpunetError(f"{path}: the sampling period {why}; give `dt_ns`")
-    if len(column) != 1:
-        column.require_length(path, name, source.n_pulses)
-    period = float(in_ns.read(0, 1)[0])
-    is_period = np.isfinite(period) and period > 0
-    if dt_ns is None and not is_period:
-        raise CpunetError(
-            f"{path}: event 0: the sampling period ({name}) is {period:g} ns", "give `dt_ns`"
-        )
-    if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
-        log.warning(
-            f"{path.name}: says that it is sampled every {period:g} ns; taken as {dt_ns:g} ns, "
-            "as given (`dt_ns`)"
-        )
-        if not is_period:
-            return dt_ns, None
-        in_ns, period = in_ns.times(dt_ns / period, "ns"), dt_ns
-    # a scalar or an array of length 1 applies to all events
-    return period, None if len(column) == 1 else in_ns
-
-
-def _energies(
-    source: PulseSource, energy: str | None, kev_per_adc: float | None
-) -> tuple[str, Column | None]:
-    """The rule of the energies in words, and energies in keV from a column.
-
-    Without ``energy``, the column ``energy_kev``, ``energy_keV`` or ``energy`` is used if it
-    is in energy units or ``kev_per_adc`` is given.  Otherwise the energy is the amplitude
-    times ``kev_per_adc``, or unknown without it.  ``energy`` names another column, or
-    ``FILE:path/to/column``.  Energies in units that are wrong or a little off are multiplied by
-    ``kev_per_adc`` as well, with a warning.
-    """
-    path = source.path
-    name = energy or next((name for name in _USUAL if name in source.columns), "")
-    if name:
-        column = source.columns[name] if name in source.columns else _elsewhere(source, name)
-        units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
-        by, rule = factor(units, "keV"), f"column {name} [{units}]"
-        if by is None and kev_per_adc is not None:
-            by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
-        elif by is not None and kev_per_adc is not None:
-            log.warning(
-                f"{path.name}: column {name} is in {units}; its energies are multiplied by "
-                f"{kev_per_adc:g}, as given (`kev_per_adc`)"
-            )
-            by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
-        if by is not None:
-            column.require_length(path, name, source.n_pulses)
-            return rule, column.times(by, "keV")
-        if energy is not None:
-            units = f"in {column.units}" if column.units else "without units"
+        periods = of_each.get("dt_ns", np.full(n, self.dt_ns))
+        other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
+        if other.any():
+            first = int(other.argmax())
             raise CpunetError(
-                f"{path}: column {name} is {units}, no energy in keV; "
-                "add `kev_per_adc` (1 if it is in keV)"
+                f"{self.path}: event {event_number[first]}: sampling period "
+                f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
+                "split the file by sampling period"
             )
-    if kev_per_adc is not None:
-        return f"amplitude x {kev_per_adc:g} keV/ADC", None
-    return f"not known{f' (column {name} is not in energy units)' if name else ''}", None
-
-
-def _elsewhere(source: PulseSource, energy: str) -> Column:
-    """A column of another file in the order of the pulses, if both tell of which events."""
-    path, columns = source.path, source.columns
-    file, colon, inner = energy.rpartition(":")
-    if not colon:
-        raise CpunetError(
-            f"{path}: no column {energy} for the energy; there are {shortened(columns)}"
+        return Pulses.of(
+            waveforms,
+            dt_ns=self.dt_ns,
+            energy_kev=energy_kev,
+            event_number=event_number,
+            t0_ns=of_each.get("t0_ns", 0.0),
         )
-    # Imported late: the LH5 library takes seconds to load, and most files do not need it.
-    from cpunet.pulses.reading.hdf5 import column_of
-
-    column, others = column_of(Path(file), inner)
-    if (rows := source.chosen) is not None and len(column) == source.n_all:
-        others = {n: c.at(rows) for n, c in others.items() if len(c) == len(column)}
-        column = column.at(rows)
-    key = next((k for k in EVENT_KEYS if k in columns and k in others), None)
-    if key is None or columns[key].constant or len(others[key]) != len(column):
-        return column
-    ours, theirs = (np.asarray(c[key].read(0, len(c[key]))) for c in (columns, others))
-    if np.array_equal(ours, theirs):
-        return column
-    _, at, of = np.intersect1d(ours, theirs, return_indices=True)
-    if not len(at) or any(len(np.unique(keys)) < len(keys) for keys in (ours, theirs)):
-        raise CpunetError(
-            f"{path}: {energy} is of other events than these pulses ({key})",
-            "give the energies of the same events",
-        )
-    log.info(
-        f"{path.name}: {energy} is in another order or of other events; joined by {key}, "
-        f"{len(ours) - len(at)} of {len(ours)} pulses have no energy there"
-    )
-    values = np.full(len(ours), np.nan)
-    values[at] = np.asarray(column.read(0, len(column)), float)[of]
-    return Column.of(values, column.units)
