@@ -11,20 +11,16 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from cpunet.pulses.shape_parameters import data_axis
-from cpunet.validation import comparisons
+from cpunet.validation import bootstraps
+from cpunet.validation.bootstraps import Resampled, resampled_quantiles
 from cpunet.validation.comparisons import (
-    Draws,
-    Resampled,
-    ceiling,
+    NODES,
+    NULL_NODES,
     compare,
+    drawn_distances,
     histogram,
-    iou,
-    iou_error,
-    null_wasserstein,
-    resampled_quantiles,
-    resampled_twice,
+    overlap,
     wasserstein,
-    wasserstein_error,
 )
 from synthetic import load_recipe
 
@@ -38,10 +34,15 @@ any_floats = arrays(
 )
 
 
-def both_resampled(n_a: int, n_b: int, draws: int, seed: int) -> Draws:
-    """Bootstraps of two sets, each of its own size."""
+def iou(a, b, axis, draws=(None, None)) -> np.ndarray:
+    """IoU of two sets, or of their bootstraps."""
+    return overlap(*(histogram(v, axis, of) for v, of in zip((a, b), draws, strict=True)))
+
+
+def resampled(events, sizes, draws: int, seed) -> list[Resampled]:
+    """Bootstraps of two sets of so many events, each of its own size."""
     rng = np.random.default_rng(seed)
-    return Resampled.of(n_a, n_a, draws, rng), Resampled.of(n_b, n_b, draws, rng)
+    return [Resampled(n, size, draws, rng) for n, size in zip(events, sizes, strict=True)]
 
 
 def test_range_comes_from_the_bulk_of_the_data():
@@ -102,10 +103,14 @@ def test_without_values_there_is_no_score():
     empty, nothing, some = np.array([]), np.array([np.nan]), np.array([1.0, 2.0])
     assert np.isnan(iou(empty, some, UNIT))
     assert np.isnan(wasserstein(empty, some))
-    assert np.isnan(iou_error(empty, some, UNIT, both_resampled(0, 2, 5, 0)))
-    assert np.isnan(wasserstein_error(nothing, some, both_resampled(1, 2, 5, 0)))
-    assert np.isnan(null_wasserstein(nothing, resampled_twice(1, 5, 5, 5, 0))).all()
-    assert np.isnan(null_wasserstein(some, resampled_twice(2, 0, 5, 5, 0))).all()
+    assert np.isnan(iou(empty, some, UNIT, resampled((0, 2), (0, 2), 5, 0))).all()
+    for both, sizes in (
+        ((nothing, some), (1, 2)),
+        ((nothing,) * 2, (5, 5)),
+        ((some,) * 2, (0, 5)),
+    ):
+        draws = resampled(map(len, both), sizes, 5, 0)
+        assert np.isnan(drawn_distances(*both, draws, NODES)).all()
 
 
 def peak_with_tail(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -130,15 +135,13 @@ def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape):
     for _ in range(150):
         data, sim = SHAPES[shape](rng, n_data), SHAPES[shape](rng, n_sim)
         axis = data_axis(data, 49)
-        pairs = resampled_twice(n_data, n_sim, n_data, 80, rng)
-        mean, std = ceiling(data, axis, pairs)
-        null, scatter = null_wasserstein(data, pairs)
-        apart = {
-            "iou": (mean - iou(data, sim, axis), std),
-            "w1": (wasserstein(data, sim) - null, scatter),
-        }
-        for name, (off, spread) in apart.items():
-            z[name].append(off / spread)
+        pairs = resampled((n_data, n_data), (n_sim, n_data), 80, rng)
+        ceiling, null = (
+            iou(data, data, axis, pairs),
+            drawn_distances(data, data, pairs, NULL_NODES),
+        )
+        z["iou"].append((ceiling.mean() - iou(data, sim, axis)) / ceiling.std())
+        z["w1"].append((wasserstein(data, sim) - null.mean()) / null.std())
     for name, values in z.items():
         values = np.array(values)
         assert 0.005 <= (values > 2).mean() <= 0.09, name
@@ -148,12 +151,12 @@ def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape):
         assert values.std() == pytest.approx(1, abs=0.2), name
 
 
-WAYS = {"events": comparisons.MAX_EVENTS, "bins": 0}  # what is drawn
+WAYS = {"events": bootstraps.MAX_EVENTS, "bins": 0}  # what is drawn
 
 
 @pytest.fixture(params=WAYS.values(), ids=WAYS.keys())
 def either_way(request, monkeypatch):
-    monkeypatch.setattr(comparisons, "MAX_EVENTS", request.param)
+    monkeypatch.setattr(bootstraps, "MAX_EVENTS", request.param)
 
 
 def test_errors_of_scores_are_the_scatter_of_fresh_samples(either_way):
@@ -165,33 +168,33 @@ def test_errors_of_scores_are_the_scatter_of_fresh_samples(either_way):
         a, b = rng.normal(size=500), rng.normal(0.5, 1.2, 600)
         a[:25], b[:10] = np.nan, np.inf
         found.append((wasserstein(a, b), iou(a, b, axis)))
-        draws = both_resampled(500, 600, 50, draw)
-        errors.append((wasserstein_error(a, b, draws), iou_error(a, b, axis, draws)))
+        draws = resampled((500, 600), (500, 600), 50, draw)
+        spread = drawn_distances(a, b, draws, NODES), iou(a, b, axis, draws)
+        errors.append([drawn.std() for drawn in spread])
     assert np.mean(errors, axis=0) == pytest.approx(np.std(found, axis=0), rel=0.2)
 
 
 def distance_of(values: np.ndarray, *weights: np.ndarray) -> float:
     """Distance of two samples of values, in each of which they occur so often."""
-    rng = np.random.default_rng(0)
-    n, many = len(values), [np.float32(of_sample)[:, np.newaxis] for of_sample in weights]
-    draws = tuple(Resampled(n, int(w.sum()), 1, rng, w) for w in many)
-    return null_wasserstein(values, draws)[0]
+    draws = resampled([0, 0], [int(w.sum()) for w in weights], 1, 0)
+    for of, of_sample in zip(draws, weights, strict=True):
+        of.events, of.weights = len(values), np.float32(of_sample)[:, np.newaxis]
+    return drawn_distances(values, values, draws, NODES)[0]
 
 
 @pytest.mark.parametrize("shift", [0.0, 0.3])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_the_distance_on_the_grid_is_that_of_scipy(shape, shift, monkeypatch):
+def test_the_distance_on_the_grid_is_that_of_scipy(shape, shift):
     """On 256 bins within 5 % of its null."""
-    monkeypatch.setattr(comparisons, "NULL_NODES", comparisons.NODES)
     rng = np.random.default_rng(8)
     values = SHAPES[shape](rng, 4000)
-    null, _ = null_wasserstein(values, resampled_twice(4000, 4000, 5000, 20, 0))
+    null = drawn_distances(values, values, resampled((4000,) * 2, (4000, 5000), 20, 0), NODES)
     values[:3] = 1e5, -1e4, 3e5
     chances = np.exp(shift * np.clip(values, -3, 3))
     weights = [rng.multinomial(4000, np.full(4000, 1 / 4000))]
     weights += [rng.multinomial(5000, chances / chances.sum())]
     exact = scipy.stats.wasserstein_distance(values, values, *weights)
-    assert distance_of(values, *weights) == pytest.approx(exact, abs=0.05 * null)
+    assert distance_of(values, *weights) == pytest.approx(exact, abs=0.05 * null.mean())
 
 
 @given(a=any_floats, b=any_floats)
@@ -240,7 +243,7 @@ def test_compare_takes_any_methods():
 @pytest.mark.parametrize("size", [2, 50])
 def test_histograms_of_the_draws_are_multinomial(size, either_way):
     bins = np.repeat([1, 2, 4, 5], [1, 3, 4, 2])  # the last is drawn and not counted
-    found = Resampled.of(10, size, 20_000, np.random.default_rng(12)).counts(bins, 5)
+    found = Resampled(10, size, 20_000, np.random.default_rng(12)).counts(bins, 5)
     assert found.shape == (5, 20_000)
     p = np.array([0, 1, 3, 0, 4]) / 10
     assert found.mean(axis=1) == pytest.approx(size * p, rel=0.03)
@@ -249,7 +252,7 @@ def test_histograms_of_the_draws_are_multinomial(size, either_way):
 
 
 def test_all_parameters_see_the_same_events():
-    draws = Resampled.of(6, 6, 50, np.random.default_rng(2))
+    draws = Resampled(6, 6, 50, np.random.default_rng(2))
     bins = np.array([0, 1, 2, 2, 1, 0])
     np.testing.assert_array_equal(draws.counts(bins, 3)[::-1], draws.counts(2 - bins, 3))
 
@@ -257,11 +260,11 @@ def test_all_parameters_see_the_same_events():
 def test_draws_without_a_finite_value_are_left_out():
     rare = np.r_[1.0, np.full(99, np.nan)]
     some = np.array([1.0, 2.0])
-    w1 = wasserstein_error(rare, some, both_resampled(100, 2, 200, 0))
-    assert w1 == pytest.approx(0.5 / np.sqrt(2), rel=0.2)  # 0, ½ or 1, in ratios 1:2:1
-    few = both_resampled(100, 2, 1, 1)
+    w1 = drawn_distances(rare, some, resampled((100, 2), (100, 2), 200, 0), NODES)
+    assert w1.std() == pytest.approx(0.5 / np.sqrt(2), rel=0.2)  # 0, ½ or 1, in ratios 1:2:1
+    few = resampled((100, 2), (100, 2), 1, 1)
     few[0].weights[0] = 0
-    assert np.isnan(wasserstein_error(rare, some, few))
+    assert np.isnan(drawn_distances(rare, some, few, NODES))
 
 
 @pytest.mark.parametrize(("n", "quantile"), [(20, 0.1), (37, 0.1), (300, 0.5), (25, 0.01)])

@@ -11,9 +11,8 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.pulses.loading import load_pulses
-from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
+from cpunet.training.job import TrainingJob
 from cpunet.translation.translator import REN
 from cpunet.validation.tune import HeldOut, own_values, tune
 from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files
@@ -37,15 +36,12 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
 
 
 def held_out(files: Files, recipe: Recipe, seed: int = 0) -> HeldOut:
-    selection = parse_selection("FEP", recipe.peaks)
-    sim = load_pulses(files.sim, "simulated", recipe, selection)
-    data = load_pulses(files.data, "measured", recipe, selection)
-    return HeldOut.of(sim, data, recipe, seed)
+    return HeldOut.of(TrainingJob.of(files, recipe, "FEP", seed=seed, device="cpu"))
 
 
 def test_held_out_pulses_are_of_the_peak_and_in_no_training(files):
     parts = held_out(files, tiny())
-    for side, held in ((parts.fit_sim, parts.sim), (parts.fit_data, parts.data)):
+    for side, held in ((parts.job.sim, parts.sim), (parts.job.data, parts.data)):
         fit = side.prepared.pulses
         events = {*fit.event_number.tolist()}, {*held.event_number.tolist()}
         assert not events[0] & events[1]
@@ -74,7 +70,7 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
     recipe = tiny("scores.bootstraps=100")
     parts = held_out(files, recipe)
     alike = parts.score(
-        Giving(parts.fit_data.prepared.pulses.waveforms[: len(parts.data)], recipe)
+        Giving(parts.job.data.prepared.pulses.waveforms[: len(parts.data)], recipe)
     )
     assert 0.3 < alike < 2
     assert parts.score(Giving(parts.data.waveforms, recipe)) == 0

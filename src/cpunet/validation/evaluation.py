@@ -21,20 +21,9 @@ from cpunet.pulses.shape_parameters import median_decay_ns
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
 from cpunet.translation.translator import REN
-from cpunet.validation.a_over_e import (
-    DEP,
-    Range,
-    RangeSurvival,
-    SurvivalRow,
-    dep_scales,
-    peak_survival,
-    subtracted,
-    survival_table,
-)
+from cpunet.validation.a_over_e import DEP, Range, dep_scales, survivals
 from cpunet.validation.ae_energy import against_energy
-from cpunet.validation.comparisons import Missing
 from cpunet.validation.methods import (
-    Translations,
     fit_baseline_methods,
     translate_all,
     true_responses,
@@ -153,13 +142,14 @@ def evaluate(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    survivals, ranges = _survivals(
+    survival, ranges = survivals(
         {
             name: {method: v["current_amplitude"] for method, v in of_peak.items()}
             for name, of_peak in values.items()
         },
         moved_amplitudes,
-        translations,
+        amplitudes,
+        energy_kev,
         lines | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
         seed,
     )
@@ -167,7 +157,7 @@ def evaluate(
     metrics = Metrics(
         compared=_compared(run, sim_set, data_set),
         peaks=peaks,
-        ae_survival=survivals,
+        ae_survival=survival,
         ae_details={"survival by energy range": ranges},
         ae_energy=against_energy(
             {method: amplitudes[method] for method in ("data", "ren")},
@@ -188,30 +178,6 @@ def evaluate(
         },
     )
     return Evaluation(run, sets, values, slices, metrics)
-
-
-def _survivals(
-    ae: Mapping[str, Mapping[str, Values]],
-    moved: Mapping[str, Values],
-    translations: Translations,
-    bands: Mapping[str, tuple[Range, list[Range]]],
-    seed: int,
-) -> tuple[dict[str, SurvivalRow] | Missing, dict[str, dict[str, RangeSurvival]] | Missing]:
-    """A/E survival of peaks, and of bands of energy with their sidebands subtracted."""
-    table = survival_table(ae, moved, seed=seed)
-    if isinstance(table, Missing):
-        return table, Missing(missing=f"there is no A/E cut: {table.missing}")
-    cuts, errors = table[DEP].cut, table[DEP].cut_std
-    values, kev = translations.amplitudes, translations.energy_kev
-    ranges = {
-        name: {
-            m: peak_survival(values[m], kev[m], cut, span, sidebands, errors[m])
-            for m, cut in cuts.items()
-        }
-        for name, (span, sidebands) in bands.items()
-        if name != DEP
-    }
-    return subtracted(table, ranges), ranges
 
 
 def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
