@@ -48,7 +48,8 @@ def scores(iou: float = 80.0, auc: float = 0.52, off: float = 1.0) -> dict[str, 
 
 
 def of(**runs: dict[str, Any]) -> Comparison:
-    return Comparison("ren", {name: Metrics(**content) for name, content in runs.items()})
+    reports = {name: Report(Metrics(**content)) for name, content in runs.items()}
+    return Comparison("ren", reports)
 
 
 def test_rows_and_what_they_show():
@@ -60,13 +61,12 @@ def test_rows_and_what_they_show():
         ("SEP", "edge RMSE"),
         ("SEP", "A/E survival minus data"),
     ]
-    shown = [[cell.text for cell in row.cells] for row in table.rows]
-    assert shown[0] == ["80.0 ± 2.5 (88.0)", "85.0 ± 2.5 (88.0)"]
-    assert shown[2] == ["0.520 ± 0.020", "0.450 ± 0.020"]
-    assert shown[3] == ["0.600", "0.600"]
-    assert shown[4] == ["+1.0 ± 2.0", "-0.5 ± 2.0"]
+    shown = [row.texts for row in table.rows]
+    assert shown[0] == shown[1] == ["80.0 ± 2.5 (88.0)", "85.0 ± 2.5 (88.0)*"]
     # an AUC of 0.52 is closer to chance than one of 0.45
-    assert [set(row.best) for row in table.rows] == [{1}, {1}, {0}, {0, 1}, {1}]
+    assert shown[2] == ["0.520 ± 0.020*", "0.450 ± 0.020"]
+    assert shown[3] == ["0.600*", "0.600*"]
+    assert shown[4] == ["+1.0 ± 2.0", "-0.5 ± 2.0*"]
     assert table.note == ""
     assert table.scores.loc["SEP", "edge RMSE [10⁻³]"].tolist() == [0.6, 0.6]
 
@@ -91,8 +91,8 @@ def test_what_a_run_lacks_is_a_dash():
     sep["parameters"]["drift_time"]["iou"].pop("ceiling")
     sep["parameters"]["drift_time"].pop("iou_std")
     table = of(old=old, new=scores())
-    assert [row.texts[0].strip("*") for row in table.rows] == ["80", "–", "–", "–", "–"]
-    assert [set(row.best) for row in table.rows] == [{0, 1}, set(), set(), set(), set()]
+    assert [row.texts[0] for row in table.rows] == ["80*", "–", "–", "–", "–"]
+    assert [row.texts[1].endswith("*") for row in table.rows] == [True] + [False] * 4
 
 
 @pytest.mark.parametrize(
@@ -201,9 +201,9 @@ def test_reports_have_the_names_of_their_folders(two, tmp_path):
     made = compare(Report(Metrics(**run), {}), two[0])
     assert str(made).splitlines()[1].split() == ["peak", "score", "new", "first"]
     a, b, _ = (report(tmp_path / run / "report", 80.0) for run in ("a", "b", "demo"))
-    assert [*compare(tmp_path / "demo", two[0] / "metrics.json").metrics] == ["demo", "first"]
-    assert [*compare(a, b).metrics] == ["a", "b"]
-    assert [*compare(a, a).metrics] == ["report (1)", "report (2)"]
+    assert [*compare(tmp_path / "demo", two[0] / "metrics.json").reports] == ["demo", "first"]
+    assert [*compare(a, b).reports] == ["a", "b"]
+    assert [*compare(a, a).reports] == ["report (1)", "report (2)"]
     with pytest.raises(CpunetError, match="none of the 1 reports is there"):
         compare(tmp_path / "nothing")
 
