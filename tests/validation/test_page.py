@@ -124,7 +124,7 @@ def test_page_shows_scores_counts_and_provenance(report):
 
 def test_a_page_begins_with_what_was_compared_and_a_picture(tmp_path):
     compared = {"simulation": "my <sim>.lh5", "fit": "chi-square is 1.1 per moment"}
-    names = ("spectrum", "FEP mean pulse", "SEP mean pulse", "SEP noise", "A over E survival")
+    names = ("losses", "FEP mean pulse", "SEP mean pulse", "SEP noise", "A over E survival")
     found = metrics() | {"compared": compared, "training": {"peak": "FEP"}}
     write_report(tmp_path, found, {name: figure() for name in names}, [])
     html = (tmp_path / "report.html").read_text()
