@@ -39,11 +39,11 @@ def test_superpulses_are_those_of_a_plain_loop():
     windows, times = pulses(np.random.default_rng(1), 90)
     times[:2] = np.nan, np.inf
     windows[4] = 0.0
-    found = superpulses(3, data=(windows, times))["data"]
+    found, means = superpulses(3, data=(windows, times))
     edges = np.quantile(np.delete(times, [0, 1]), [0, 1 / 3, 2 / 3, 1])
-    np.testing.assert_allclose(found.edges, edges)
+    np.testing.assert_allclose(found, edges)
     edges[-1] += 0.01  # the last edge is included
-    for i, pulse in enumerate(found.pulses):
+    for i, pulse in enumerate(means["data"][1:]):
         rows = [r for r in range(90) if edges[i] <= times[r] < edges[i + 1] and r != 4]
         aligned = around_half(windows[rows], DT).astype(float)
         assert pulse.n == len(rows)
@@ -54,10 +54,9 @@ def test_superpulses_are_those_of_a_plain_loop():
 
 def test_nothing_in_a_slice_is_no_failure():
     windows, times = pulses(np.random.default_rng(5), 40)
-    found = superpulses(2, data=(windows, times), raw=(windows, times + 1e6))
-    assert all(pulse.n == 0 for pulse in found["raw"].pulses)
-    slices = zip(found["data"].pulses, found["raw"].pulses, strict=True)
-    columns = {str(i): {"data": one, "raw": other} for i, (one, other) in enumerate(slices)}
+    _, means = superpulses(2, data=(windows, times), raw=(windows, times + 1e6))
+    assert all(pulse.n == 0 for pulse in means["raw"][1:])
+    columns = {str(i): {m: of[i] for m, of in means.items()} for i in (1, 2)}
     require_drawn(shape_figure(columns, DT, "SEP"))
 
 

@@ -151,7 +151,7 @@ def test_scores_of_pairs_are_those_of_the_windows_without_noise(found):
     each = [translations.without_noise(row) for row in rows]
     windows = {method: np.concatenate([one[method] for one in each]) for method in each[0]}
     assert set(windows) == {"raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth"}
-    scores = peak.paired_scores()
+    scores = found.metrics.peaks[peak.name].paired
     squares = pair_squares(windows, windows["truth"], found.run.recipe.scores.edge_samples)
     for method, score in scores.items():
         direct = scores_of_squares(squares[method])

@@ -235,8 +235,8 @@ def survival_table(
         if len(ends) == 2 and min(np.isfinite(v).sum(axis=2).min() for v in ends) >= MIN_EVENTS:
             quantile: Any = {"axis": 2, "keepdims": True, "method": "weibull"}
             cuts = np.nanquantile(ends[0], 1 - ACCEPTANCE, **quantile)
-            shares = (ends[1] >= cuts).sum(axis=2) / np.isfinite(ends[1]).sum(axis=2)
-            of_fit = float(50 * np.linalg.norm(shares[:, 0] - shares[:, 1]))
+            percent = 100 * ((ends[1] >= cuts).sum(axis=2) / np.isfinite(ends[1]).sum(axis=2))
+            of_fit = float(np.sqrt((0.25 * (percent[:, 0] - percent[:, 1]) ** 2).sum()))
             row.of_fit = of_fit
         if "ren" in survival:
             passed, error = survival["ren"]

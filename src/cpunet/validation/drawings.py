@@ -92,14 +92,13 @@ def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
         else:
             further[parameter] = by_method
     drawn["further parameters"] = partial(further_histograms, further, bins, name)
-    slices = evaluated.slices[name]
-    means = {"": {method: of_method.whole for method, of_method in slices.items()}}
+    edges, means = evaluated.slices[name]
+    whole = {"": {method: of_method[0] for method, of_method in means.items()}}
     title = f"{name}: mean pulse"
-    drawn["mean pulse"] = partial(shape_figure, means, dt_ns, title)
-    edges = slices["data"].edges
+    drawn["mean pulse"] = partial(shape_figure, whole, dt_ns, title)
     columns = {
-        f"{low:.0f} … {high:.0f} ns": {m: slices[m].pulses[i] for m in SLICED if m in slices}
-        for i, (low, high) in enumerate(pairwise(edges))
+        f"{low:.0f} … {high:.0f} ns": {m: means[m][i] for m in SLICED if m in means}
+        for i, (low, high) in enumerate(pairwise(edges), start=1)
     }
     title = f"{name}: superpulses in slices of rise time 1–90 %"
     drawn["superpulses"] = partial(shape_figure, columns, dt_ns, title)

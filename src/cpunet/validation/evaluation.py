@@ -34,7 +34,6 @@ from cpunet.validation.peaks import (
     PeakSets,
     Slices,
     fit_ends,
-    moved_values,
     score_peak,
     sliced,
 )
@@ -60,7 +59,7 @@ class Evaluation:
     run: Run
     sets: list[PeakSets]
     values: Mapping[str, ByMethod]
-    slices: Mapping[str, Mapping[str, Slices]]
+    slices: Mapping[str, Slices]
     metrics: Metrics
 
 
@@ -117,18 +116,13 @@ def evaluate(
         for method, windows in translations.windows.items()
     }
     ends = fit_ends(run, ren)
-    score = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
-
-    def scored(peak: PeakSets) -> tuple[dict[str, Values], ByMethod, PeakScores]:
-        moved = moved_values(peak, ends, seed)
-        return moved, *score(peak, moved)
-
+    score = partial(score_peak, ends=ends, seed=seed, scales=scales, decays_ns=decays)
     values: dict[str, ByMethod] = {}
     peaks: dict[str, PeakScores] = {}
-    slices: dict[str, dict[str, Slices]] = {}
+    slices: dict[str, Slices] = {}
     moved_amplitudes: dict[str, Values] = {}
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
-        for peak, (moved, by_method, scores) in zip(sets, pool.map(scored, sets), strict=True):
+        for peak, (by_method, moved, scores) in zip(sets, pool.map(score, sets), strict=True):
             peaks[peak.name] = scores
             if moved:
                 moved_amplitudes[peak.name] = moved["current_amplitude"]
