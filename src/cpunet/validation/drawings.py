@@ -14,7 +14,7 @@ from cpunet.pulses.shape_parameters import A_OVER_E, data_axis
 from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.evaluation import Evaluation
-from cpunet.validation.peaks import MeanPulse, PeakSets, around_half
+from cpunet.validation.peaks import MeanPulse, PeakSets, around_half, sliced
 from cpunet.validation.run_figures import (
     ae_energy_figure,
     cycle_figure,
@@ -44,15 +44,12 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
         drawn["overlap with data"] = partial(overlap_figure, metrics, peaks)
     if courses := metrics.ae_energy.methods:
         drawn["A over E and energy"] = partial(ae_energy_figure, courses)
-    for peak in evaluated.sets:
-        if peak.name in evaluated.values:
-            of_peak = _of_peak(peak, evaluated)
-            drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak.items()}
-    if DEP in evaluated.values and len(evaluated.values) > 1:
-        ae = {
-            name: {m: v["current_amplitude"] for m, v in of_peak.items()}
-            for name, of_peak in evaluated.values.items()
-        }
+    scored = [peak for peak in evaluated.sets if peak.values]
+    for peak in scored:
+        of_peak = _of_peak(peak, evaluated)
+        drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak.items()}
+    ae = {p.name: {m: v["current_amplitude"] for m, v in p.values.items()} for p in scored}
+    if DEP in ae and len(ae) > 1:
         drawn["A over E survival"] = partial(roc_figure, ae, DEP)
     fullest = max(
         evaluated.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values())
@@ -78,7 +75,7 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
 
 def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
     name, dt_ns, bins = peak.name, evaluated.run.dt_ns, evaluated.run.recipe.scores.max_bins
-    scores, values = evaluated.metrics.peaks[name], evaluated.values[name]
+    scores, values = evaluated.metrics.peaks[name], peak.values
     drawn: dict[str, Drawing] = {}
     further: dict[str, dict[str, Values]] = {}
     for parameter, data in values["data"].items():
@@ -92,7 +89,8 @@ def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
         else:
             further[parameter] = by_method
     drawn["further parameters"] = partial(further_histograms, further, bins, name)
-    edges, means = evaluated.slices[name]
+    rise_time = {method: v["rise_01_90"] for method, v in values.items()}
+    edges, means = sliced(peak.windows, rise_time, dt_ns)
     whole = {"": {method: of_method[0] for method, of_method in means.items()}}
     title = f"{name}: mean pulse"
     drawn["mean pulse"] = partial(shape_figure, whole, dt_ns, title)

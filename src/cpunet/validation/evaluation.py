@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,7 +13,7 @@ from cpunet.errors import CpunetError
 from cpunet.processes import one_thread_for_matrices, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
-from cpunet.pulses.parameters import Values, tail_slope
+from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.shape_parameters import median_decay_ns
@@ -28,15 +27,8 @@ from cpunet.validation.methods import (
     translate_all,
     true_responses,
 )
-from cpunet.validation.metrics import Metrics, PeakScores
-from cpunet.validation.peaks import (
-    ByMethod,
-    PeakSets,
-    Slices,
-    fit_ends,
-    score_peak,
-    sliced,
-)
+from cpunet.validation.metrics import Metrics
+from cpunet.validation.peaks import PeakSets, fit_ends, score_peak
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
 
@@ -49,17 +41,14 @@ class Evaluation:
     ----------
     run
         The run.
-    sets, values, slices
-        Pulses, and parameters and mean pulses by method, each by peak.  The latter two exist
-        only for scored peaks.
+    sets
+        Pulses of each peak and, if it is scored, their parameters.
     metrics
         All numbers.
     """
 
     run: Run
     sets: list[PeakSets]
-    values: Mapping[str, ByMethod]
-    slices: Mapping[str, Slices]
     metrics: Metrics
 
 
@@ -117,34 +106,27 @@ def evaluate(
     }
     ends = fit_ends(run, ren)
     score = partial(score_peak, ends=ends, seed=seed, scales=scales, decays_ns=decays)
-    values: dict[str, ByMethod] = {}
-    peaks: dict[str, PeakScores] = {}
-    slices: dict[str, Slices] = {}
-    moved_amplitudes: dict[str, Values] = {}
+    peaks = {}
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
-        for peak, (by_method, moved, scores) in zip(sets, pool.map(score, sets), strict=True):
+        for peak, scores in zip(sets, pool.map(score, sets), strict=True):
             peaks[peak.name] = scores
-            if moved:
-                moved_amplitudes[peak.name] = moved["current_amplitude"]
-            if by_method:
-                values[peak.name] = by_method
-                rise = {method: v["rise_01_90"] for method, v in by_method.items()}
-                slices[peak.name] = sliced(peak.windows, rise, run.dt_ns)
             bar.update(1)
-    if not values:
+    name = "current_amplitude"
+    ae = {p.name: {m: v[name] for m, v in p.values.items()} for p in sets if p.values}
+    if not ae:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
+    continua: dict[str, tuple[Range, list[Range]]] = {
+        n: (span, []) for n, span in recipe.scores.continuum_kev.items()
+    }
     survival, ranges = survivals(
-        {
-            name: {method: v["current_amplitude"] for method, v in of_peak.items()}
-            for name, of_peak in values.items()
-        },
-        moved_amplitudes,
+        ae,
+        {peak.name: peak.moved[name] for peak in sets if peak.moved},
         amplitudes,
         energy_kev,
-        lines | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
+        lines | continua,
         seed,
     )
     tails = None if run.fit is None else run.fit.tails
@@ -171,7 +153,7 @@ def evaluate(
             "data": data_set.prepared.rejections,
         },
     )
-    return Evaluation(run, sets, values, slices, metrics)
+    return Evaluation(run, sets, metrics)
 
 
 def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:

@@ -27,7 +27,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Self
 
@@ -91,10 +91,6 @@ class MeanPulse:
         return cls(mean, error, int(np.isfinite(aligned).any(axis=1).sum()))
 
 
-# edges of rise time, and by method the mean of all pulses and that of each slice
-Slices = tuple[Values, dict[str, list[MeanPulse]]]
-
-
 def around_half(windows: FloatArray, dt_ns: float) -> FloatArray:
     """Pulses from `BEFORE_NS` before their half maximum to `AFTER_NS` after it."""
     before, after = round(BEFORE_NS / dt_ns), round(AFTER_NS / dt_ns)
@@ -106,7 +102,7 @@ def sliced(
     rise_time: Mapping[str, Values],
     dt_ns: float,
     slices: int = SLICES,
-) -> Slices:
+) -> tuple[Values, dict[str, list[MeanPulse]]]:
     """Mean pulses of each method, in the same slices of the rise time for all.
 
     Parameters
@@ -140,7 +136,7 @@ def sliced(
     return edges, means
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class PeakSets:
     """The pulses of one peak, as rows of the whole datasets.
 
@@ -153,11 +149,17 @@ class PeakSets:
     rows
         Rows of the pulses with noise, by method: the data, then from the simplest method to the
         truth; of translations those that can be prepared.
+    values
+        Pulse-shape parameters by method and name; empty if the peak is not scored.
+    moved
+        What the errors of the fit do to translated pulses, see `moved_values`.
     """
 
     name: str
     translations: Translations
     rows: dict[str, Rows]
+    values: ByMethod = field(default_factory=dict)
+    moved: dict[str, Values] = field(default_factory=dict)
 
     @classmethod
     def of(cls, name: str, chosen: EnergySelection, translations: Translations) -> Self:
@@ -187,13 +189,13 @@ def score_peak(
     seed: int,
     scales: Mapping[str, tuple[float, float]],
     decays_ns: Mapping[str, float],
-) -> tuple[ByMethod, dict[str, Values], PeakScores]:
+) -> PeakScores:
     """Compare the pulses of a peak, method by method.
 
     Parameters
     ----------
     peak
-        Pulses of the peak.
+        Pulses of the peak, whose values are set.
     ends
         See `fit_ends`.
     seed
@@ -202,15 +204,6 @@ def score_peak(
         A/E of the single-site peak in the double-escape peak and its error, by method.
     decays_ns
         Decay of all pulses of a method, for which LEGEND's parameters are corrected.
-
-    Returns
-    -------
-    values
-        Pulse-shape parameters by method and name.  Empty if the peak is not scored.
-    moved
-        What the errors of the fit do to translated pulses, see `moved_values`.
-    scores
-        Scores of the peak.
     """
     of_all, raw, data = peak.translations, peak.rows["raw"], peak.rows["data"]
     lost = {m: int((~whole[raw]).sum()) for m, whole in of_all.whole.items() if m != "data"}
@@ -222,9 +215,9 @@ def score_peak(
     if few:
         result.parameters = {}
         result.missing = f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)"
-        return {}, {}, result
+        return result
     dt_ns, recipe = of_all.ren.dt_ns, of_all.ren.recipe
-    values = {
+    values = peak.values = {
         method: all_parameters(
             Pulses.of(peak.windows(method), dt_ns=dt_ns),
             recipe.preparation,
@@ -235,8 +228,8 @@ def score_peak(
         for method, rows in peak.rows.items()
     }
     methods = [method for method in values if method != "data"]
-    moved = moved_values(peak, ends, seed)
-    moved_by = {method: dict(moved) if method == "ren" else {} for method in methods}
+    peak.moved = moved_values(peak, ends, seed)
+    moved = {method: dict(peak.moved) if method == "ren" else {} for method in methods}
     for method, of_method in values.items() if scales else ():
         a_over_e = of_method[A_OVER_E] = of_method["current_amplitude"] / scales[method][0]
         if method != "data":
@@ -244,13 +237,13 @@ def score_peak(
             own, other = (scales[m][1] / scales[m][0] for m in ("data", method))
             error = np.hypot(own, other)
             both = np.stack([a_over_e * (1 + error), a_over_e * (1 - error)])
-            moved_by[method][A_OVER_E] = both[np.newaxis]
+            moved[method][A_OVER_E] = both[np.newaxis]
     others = {method: values[method] for method in methods}
-    compared = compare(values["data"], others, recipe.scores, seed, moved_by)
+    compared = compare(values["data"], others, recipe.scores, seed, moved)
     result.parameters = {name: compared.pop(name) for name in PARAMETERS}
     result.further = compared
     with ThreadPoolExecutor(usable_cores()) as pool:
-        tests = pool.map(partial(classifier_test, peak, values, seed), methods)
+        tests = pool.map(partial(classifier_test, peak, seed), methods)
         result.two_sample = dict(zip(methods, tests, strict=True))
     samples, before = recipe.preparation.baseline_samples, recipe.preparation.samples_before
     result.noise = baseline_spectra(
@@ -262,27 +255,23 @@ def score_peak(
     if of_all.squares:
         rows = peak.known_to_all()
         result.paired = {m: scores_of_squares(of[rows]) for m, of in of_all.squares.items()}
-    return values, moved, result
+    return result
 
 
-def classifier_test(
-    peak: PeakSets, values: ByMethod, seed: int, method: str
-) -> TwoSample | Missing:
+def classifier_test(peak: PeakSets, seed: int, method: str) -> TwoSample | Missing:
     """Classifier test between a method and the data by their pulses and chief parameters.
 
     Parameters
     ----------
     peak
-        Pulses of the peak.
-    values
-        Their pulse-shape parameters by method.
+        Pulses of the peak and their values.
     seed
         Seed of the folds.
     method
         Name of the method.
     """
     both = ("data", method)
-    data, own = ({name: values[m][name] for name in PARAMETERS} for m in both)
+    data, own = ({n: peak.values[m][n] for n in PARAMETERS} for m in both)
     try:
         return classifier_auc(*map(peak.windows, both), seed=seed, features=(data, own))
     except CpunetError as error:

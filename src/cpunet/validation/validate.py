@@ -131,7 +131,8 @@ def _validated(
 
         notes = _notes(run, truth)
         drawn = drawings(evaluation)
-        report = Report(evaluation.metrics, evaluation.values, out, drawn, notes)
+        values = {peak.name: peak.values for peak in evaluation.sets if peak.values}
+        report = Report(evaluation.metrics, values, out, drawn, notes)
         del evaluation  # all pulses
         if aside is not None:
             report.write(aside)
