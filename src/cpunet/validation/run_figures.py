@@ -140,9 +140,7 @@ def parameter_histograms(
             share, of_data = (counts[m] / sizes[m] for m in (method, "data"))
             common = (counts[method] + counts["data"]) / (sizes[method] + sizes["data"])
             error = np.sqrt(common * (1 / sizes[method] + 1 / sizes["data"]))
-            pull = np.divide(
-                share - of_data, error, out=np.full_like(error, np.nan), where=error > 0
-            )
+            pull = (share - of_data) / np.where(error > 0, error, np.nan)
             steps(below, pull, axis.edges, method, label(method))
     sigma_panel(below)
     below.set_xlabel(axes.get_xlabel())
@@ -296,13 +294,8 @@ def shape_figure(
                 mean = mean * (data.mean[-1] / mean[-1])
             line(above, time_ns, mean, method, label(method))
             if method != "data":
-                offset = mean - data.mean
-                error = np.full(len(offset), 0.01)
-                if data.n > 1:
-                    error = np.hypot(pulse.error, data.error)
-                pull = np.divide(
-                    offset, error, out=np.full_like(offset, np.nan), where=error > 0
-                )
+                error = np.hypot(pulse.error, data.error) if data.n > 1 else np.array(0.01)
+                pull = (mean - data.mean) / np.where(error > 0, error, np.nan)
                 line(below, time_ns, pull, method)
         most = max((pulse.n for method, pulse in pulses.items() if method != "data"), default=0)
         counts = f"{data.n} measured, {most} simulated pulses"
@@ -445,11 +438,9 @@ def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
         group(bars, method)
         if method != "data":
             # bands without noise in the data have no ratio
-            ratio, spread = (
-                np.divide(values, data, where=data > 0, out=np.full_like(data, np.nan))
-                for values in (power, error)
-            )
-            group(below.errorbar(spectrum.frequency_mhz, ratio, spread, **look), method)
+            usual = np.where(data > 0, data, np.nan)
+            bars = below.errorbar(spectrum.frequency_mhz, power / usual, error / usual, **look)
+            group(bars, method)
     below.axhline(1, color="black", linewidth=0.8)
     silent = not any(any(spectrum.power) for spectrum in drawn.values())
     above.set(
