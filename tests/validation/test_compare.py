@@ -206,6 +206,8 @@ def test_the_command(two, tmp_path, capsys):
     assert page.read_text() == first
     assert run(["compare", words[1], str(tmp_path / "none")]) == 0
     assert "no report: none" in capsys.readouterr().out
+    with pytest.raises(CpunetError, match="is a folder; give the name of a page"):
+        compare(*two, out=page.parent, force=True)
 
 
 DEFECTS = {
@@ -224,9 +226,3 @@ def test_bad_metrics_are_told(two, tmp_path, defect):
     with pytest.raises(CpunetError, match=re.escape(f"{bad}: {words}")):
         compare(*two, out=tmp_path / "page.html")
     assert not (tmp_path / "page.html").exists()
-
-
-def test_a_folder_is_no_page(two, tmp_path):
-    (tmp_path / "folder").mkdir()
-    with pytest.raises(CpunetError, match="is a folder; give the name of a page"):
-        compare(*two, out=tmp_path / "folder", force=True)

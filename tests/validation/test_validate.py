@@ -22,13 +22,8 @@ from cpunet.validation.methods import pair_squares, scores_of_squares
 from cpunet.validation.validate import validate
 from synthetic import after_pole, decay, leave_undrawn, load_recipe, phased_edges, write_pulses
 
-RECIPE = load_recipe(
-    "fast",
-    [
-        "scores.bootstraps=10",
-        "generator.poles_ns=[60]",  # what a fit cannot follow takes long to be looked for
-    ],
-)
+# more poles than these pulses have take long to be looked for
+RECIPE = load_recipe("fast", ["scores.bootstraps=10", "generator.poles_ns=[60]"])
 KEV = {"FEP": 2614.511, "SEP": 2103.511, "DEP": 1592.511}
 
 
@@ -66,13 +61,9 @@ def run(files, tmp_path_factory) -> Run:
     return train(files["sim"], files["data"], out, recipe=RECIPE, seed=0, device="cpu")
 
 
-def evaluated(run: Run, sim: PulseFile, data: PulseFile) -> Evaluation:
-    return evaluate(run, sim, data, baselines=False)
-
-
 @pytest.fixture(scope="module")
 def whole(run, files) -> Evaluation:
-    return evaluated(run, files["sim"], files["data"])
+    return evaluate(run, files["sim"], files["data"], baselines=False)
 
 
 @pytest.mark.thorough
@@ -100,8 +91,12 @@ def test_every_figure_can_be_drawn(whole) -> None:
     made = drawings(whole)
     assert {"FEP mean pulse", "SEP superpulses", "SEP single pulse", "losses"} <= set(made)
     assert {"FEP cycle of simulation", "FEP cycle of data"} <= set(made)
-    for drawing in made.values():
-        assert drawing().axes
+    assert all(draw().axes for draw in made.values())
+    weights = {n: w for n, w in whole.run.weights.items() if not n.startswith("iren.")}
+    alone = whole.run.model_copy(update={"weights": weights})
+    made = drawings(dataclasses.replace(whole, run=alone))
+    assert "losses" in made
+    assert not any("cycle" in name for name in made)
 
 
 def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) -> None:
@@ -132,7 +127,7 @@ def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkey
 def test_nothing_to_score_is_an_error(run, files, tmp_path) -> None:
     other = write(tmp_path / "other.lh5", {2030.0: 40}, 4, measured=True)
     with pytest.raises(CpunetError, match="no peak has pulses on both sides"):
-        evaluated(run, files["sim"], other)
+        evaluate(run, files["sim"], other, baselines=False)
 
 
 @pytest.fixture(scope="module")
@@ -162,33 +157,13 @@ def test_scores_of_pairs_are_those_of_the_windows_without_noise(found):
 def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     peak = found.sets[0]
     pulses = {method: peak.windows(method) for method in peak.rows}
-    assert list(pulses) == [
-        "data",
-        "raw",
-        "rc",
-        "rc_late",
-        "gauss_exp",
-        "superpulse",
-        "ren",
-        "truth",
-    ]
-    raw = peak.rows["raw"]
+    names = ("data", "raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth")
+    assert tuple(pulses) == names
+    raw, of = peak.rows["raw"], peak.translations
     assert all(len(p) == len(raw) for m, p in pulses.items() if m != "data")
-    again = peak.translations.ren.apply(
-        peak.translations.windows["raw"],
-        energy_kev=peak.translations.energy_kev["raw"],
-        generator=np.random.default_rng(0),
-    )
+    how = {"energy_kev": of.energy_kev["raw"], "generator": np.random.default_rng(0)}
+    again = of.ren.apply(of.windows["raw"], **how)
     np.testing.assert_array_equal(pulses["ren"], again[raw])
-
-
-def test_a_run_of_ren_alone_is_drawn_without_cycles(whole) -> None:
-    weights = {n: w for n, w in whole.run.weights.items() if not n.startswith("iren.")}
-    made = drawings(
-        dataclasses.replace(whole, run=whole.run.model_copy(update={"weights": weights}))
-    )
-    assert "losses" in made
-    assert not any("cycle" in name for name in made)
 
 
 @pytest.fixture(scope="module")

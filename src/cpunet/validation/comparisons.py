@@ -39,11 +39,10 @@ Histogram = npt.NDArray[np.floating]
 TEST_BINS, EXPECTED = 16, 15
 
 
-def _number(value: Any) -> float | None:
-    return float(value) if value is not None and math.isfinite(value) else None
-
-
-Number = Annotated[float | None, BeforeValidator(_number)]  # None if it does not exist
+Number = Annotated[  # None if it does not exist
+    float | None,
+    BeforeValidator(lambda v: None if v is None or not math.isfinite(v) else float(v)),
+]
 ByMethod = Mapping[str, Number]
 
 

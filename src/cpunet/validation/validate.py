@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -118,10 +118,8 @@ def _validated(
     """Scores, and functions that draw; translated pulses are forgotten."""
     pair = run.sim.reading(pair[0]), run.data.reading(pair[1])
     read = (run.folder, *pair[0].files, *pair[1].files, truth)
-    with ExitStack() as stack:
-        aside = None
-        if out is not None:
-            aside = stack.enter_context(folder_written_aside(out, REPORT, *read, force=force))
+    written = folder_written_aside(out, REPORT, *read, force=force) if out else nullcontext()
+    with written as aside:
         # imported late: not needed for the help of the command
         from cpunet.validation.evaluation import evaluate
 
