@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import matplotlib as mpl
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 from scipy.special import ndtr
 
 from cpunet.pulses.parameters import PARAMETERS, align_half_maximum
@@ -22,18 +19,9 @@ from synthetic import LOSS_NAMES, load_recipe, require_drawn
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 
 
-def log(n: int, names: Sequence[str] = LOSS_NAMES) -> list[dict]:
-    return [
-        {"iteration": 10 * i, "losses": dict.fromkeys(names, 1 / (i + 1))} for i in range(n)
-    ]
-
-
-def histogram_figure(values: dict[str, np.ndarray]) -> Figure:
-    data = {"drift_time": values["data"]}
-    methods = {m: {"drift_time": v} for m, v in values.items() if m != "data"}
-    comparison = compare(data, methods, SCORES, seed=1)["drift_time"]
-    axis = data_axis(values["data"], SCORES.max_bins)
-    return run_figures.parameter_histograms(values, axis, "drift_time", "SEP", comparison)
+def log(n: int) -> list[dict]:
+    losses = [dict.fromkeys(LOSS_NAMES, 1 / (i + 1)) for i in range(n)]
+    return [{"iteration": 10 * i, "losses": of} for i, of in enumerate(losses)]
 
 
 def pulses(n: int, centre: float = 350.0) -> np.ndarray:
@@ -78,7 +66,10 @@ def test_histogram_legend_tells_scores_and_counts():
         "raw": np.r_[rng.normal(900, 50, 400), np.nan],
         "ren": rng.normal(1410, 100, 400),
     }
-    figure = histogram_figure(values)
+    data, *methods = ({"drift_time": v} for v in values.values())
+    comparison = compare(data, dict(zip(("raw", "ren"), methods, strict=True)), SCORES, 1)
+    axis, name = data_axis(values["data"], SCORES.max_bins), "drift_time"
+    figure = run_figures.parameter_histograms(values, axis, name, "SEP", comparison[name])
     require_drawn(figure)
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts[0].startswith("Data (data vs data ")
@@ -124,16 +115,12 @@ def test_the_nearest_pulse_is_that_of_a_plain_loop():
     rng = np.random.default_rng(0)
     windows = edges(rng.uniform(4, 20, 50)) + rng.normal(0, 0.003, (50, 600)).astype("f4")
     wanted = shape(9.0, centre=270.3)
-    rms = [
-        np.sqrt(np.mean((align_half_maximum(w[np.newaxis], 100, 150)[0] - wanted) ** 2))
-        for w in windows
-    ]
+    aligned = [align_half_maximum(pulse[np.newaxis], 100, 150)[0] for pulse in windows]
+    rms = [np.sqrt(np.mean((pulse - wanted) ** 2)) for pulse in aligned]
     row, found = nearest(around_half(windows, 16.0), wanted)
     assert row == int(np.argmin(rms))
     assert found == pytest.approx(min(rms), rel=1e-4)
-
-
-def test_pulses_that_cannot_be_compared_are_never_nearest():
+    # pulses that cannot be compared are never nearest
     windows = np.concatenate([edges([9.0], centre=595.0), edges([5.0, 6.0, 7.0])])
     windows[1], windows[2] = 0, np.nan  # and of the first, little is in the record
     assert nearest(around_half(windows, 16.0), shape(9.0))[0] == 3

@@ -28,11 +28,10 @@ def pulses(rng, n, width=5.0, noise=0.002):
     return windows.astype(np.float32), drift[:, 0] * DT
 
 
-def superpulses(slices=4, **sets):
+def superpulses(slices, **sets):
     """Superpulses of sets of pulses and times, by name."""
-    windows = {name: pulses for name, (pulses, _) in sets.items()}
-    times = {name: times for name, (_, times) in sets.items()}
-    return sliced(windows.__getitem__, times, DT, slices)
+    times = {name: of_set[1] for name, of_set in sets.items()}
+    return sliced(lambda name: sets[name][0], times, DT, slices)
 
 
 def test_superpulses_are_those_of_a_plain_loop():
@@ -102,30 +101,20 @@ def test_pairs_that_cannot_be_aligned_are_counted():
 
 
 def prepared(index, n_read):
-    return SimpleNamespace(
-        prepared=SimpleNamespace(index=index, n_read=n_read), path="sim.lh5", dt_ns=16.0
-    )
+    return SimpleNamespace(prepared=SimpleNamespace(index=index, n_read=n_read), path="sim.lh5")
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float64])
 def test_responses_are_those_of_the_pulses_in_use(tmp_path, dtype):
-    response = np.arange(40.0).reshape(20, 2).astype(dtype)
-    np.savez_compressed(tmp_path / "truth.npz", other=np.zeros(3), response=response)
+    path, response = tmp_path / "truth.npz", np.arange(40.0).reshape(20, 2).astype(dtype)
+    np.savez_compressed(path, other=np.zeros(3), response=response)
     used = np.array([0, 1, 2, 9, 10, 17, 19])
-    found = true_responses(tmp_path / "truth.npz", prepared(used, 20))
+    found = true_responses(path, prepared(used, 20))
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, response[used])
-
-
-def test_responses_none_of_which_is_finite_are_refused(tmp_path):
-    np.savez(tmp_path / "truth.npz", response=np.full((20, 2), np.inf))
+    np.savez(path, response=np.full((20, 2), np.inf))
     with pytest.raises(CpunetError, match=r"truth.npz: no response is finite"):
-        true_responses(tmp_path / "truth.npz", prepared(np.arange(20), 20))
-
-
-def test_responses_that_cannot_be_read(tmp_path):
-    path = tmp_path / "truth.npz"
-    np.savez(path, response=np.ones((20, 300)))
-    path.write_bytes(path.read_bytes()[:5000])
+        true_responses(path, prepared(np.arange(20), 20))
+    path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(CpunetError, match="cannot be read as NumPy file"):
         true_responses(path, prepared(np.arange(20), 20))
