@@ -271,23 +271,20 @@ def peak_survival(
     cut_std
         Error of the cut.
     """
-    finite = np.isfinite(amplitude)
-    in_peak, aside = np.zeros((2, len(energy_kev)), bool)
-    for inside, ranges in ((in_peak, [peak]), (aside, sidebands)):
-        for low, high in ranges:
-            inside |= (energy_kev >= low) & (energy_kev < high)
-    undefined = int((~finite & (in_peak | aside)).sum())
+    inside = [
+        np.concatenate(
+            [np.empty(0), *(amplitude[(energy_kev >= a) & (energy_kev < b)] for a, b in of)]
+        )
+        for of in ([peak], sidebands)
+    ]
+    events = [finite_values(values) for values in inside]
+    n, n_side = map(len, events)
     width = sum(high - low for low, high in sidebands)
     scale = (peak[1] - peak[0]) / width if width else 0.0
-    n, n_side = (int((finite & inside).sum()) for inside in (in_peak, aside))
     # survivors of the cut and, for its error, of those that are lower and higher by it
-    lowest = np.nan if cut is None else cut
+    lowest, error = np.nan if cut is None else cut, cut_std or 0.0
     survivors = [
-        [
-            int((finite & inside & (amplitude >= lowest + by)).sum())
-            for inside in (in_peak, aside)
-        ]
-        for by in (0.0, -(cut_std or 0.0), cut_std or 0.0)
+        [int((values >= lowest + by).sum()) for values in events] for by in (0.0, -error, error)
     ]
     (survival, std), (low, _), (high, _) = (
         sideband_survival(passing, n, side_pass, n_side, scale)
@@ -300,7 +297,7 @@ def peak_survival(
         sideband=n_side,
         sideband_pass=side_pass,
         scale=scale,
-        undefined=undefined,
+        undefined=sum(map(len, inside)) - n - n_side,
     )
     span = f"from {peak[0]:g} to {peak[1]:g} keV"
     if not np.isfinite(lowest):
