@@ -6,7 +6,7 @@ import hist
 import numpy as np
 import pytest
 import scipy.stats
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
@@ -58,7 +58,6 @@ def test_range_comes_from_the_bulk_of_the_data():
 
 
 @given(a=any_floats, b=any_floats)
-@settings(max_examples=100, deadline=None)
 def test_any_data_can_be_binned_and_every_event_is_counted(a, b):
     score = iou(a, b, UNIT)
     assert 0 <= score <= 100 + 1e-9
@@ -189,7 +188,6 @@ def test_the_distance_on_the_grid_is_that_of_scipy(shape, shift):
 
 
 @given(a=any_floats, b=any_floats)
-@settings(max_examples=100, deadline=None)
 def test_the_distance_of_few_values_on_the_grid_is_exact(a, b):
     a, b = a[np.isfinite(a)], b[np.isfinite(b)]
     if not (a.size and b.size):

@@ -27,17 +27,17 @@ RECIPE = load_recipe("fast", ["scores.bootstraps=10", "generator.poles_ns=[60]"]
 KEV = {"FEP": 2614.511, "SEP": 2103.511, "DEP": 1592.511}
 
 
-def records(n: int, rng: np.random.Generator, tau: float | None) -> np.ndarray:
-    """Edges of various widths at sample 450 of 1100, behind a pole and a decay if measured."""
-    pulses = phased_edges(n, rng, 450, 1100)
-    return pulses if tau is None else after_pole(pulses, 4.0, 60) * decay(450, tau, 1100)
+def measured_shape(simulated: np.ndarray) -> np.ndarray:
+    return after_pole(simulated, 4.0, 60) * decay(450, 4000.0, 1100)
 
 
 def write(path: Path, counts: dict[float, int], seed: int, *, measured: bool) -> PulseFile:
+    """Edges of various widths, behind a pole and a decay if measured."""
     rng = np.random.default_rng(seed)
     kev = np.repeat(list(counts), list(counts.values())).astype(float)
-    waveforms = records(len(kev), rng, 4000.0 if measured else None)
+    waveforms = phased_edges(len(kev), rng, 450, 1100)
     if measured:
+        waveforms = measured_shape(waveforms)
         noise = rng.normal(0, 2.0, waveforms.shape)
         waveforms = np.round(1000 + 10 * kev[:, None] * waveforms + 10 * noise)
     write_pulses(path, Pulses.of(waveforms, dt_ns=16, energy_kev=kev), table="geds/raw")
@@ -62,8 +62,11 @@ def run(files, tmp_path_factory) -> Run:
 
 
 @pytest.fixture(scope="module")
-def whole(run, files) -> Evaluation:
-    return evaluate(run, files["sim"], files["data"], baselines=False)
+def found(run, files, tmp_path_factory) -> Evaluation:
+    path = tmp_path_factory.mktemp("truth") / "truth.npz"
+    n, rng = files["sim"].open().n_pulses, np.random.default_rng(1)
+    np.savez(path, response=measured_shape(phased_edges(n, rng, 450, 1100)).astype(np.float32))
+    return evaluate(run, files["sim"], files["data"], truth=path)
 
 
 @pytest.mark.thorough
@@ -74,8 +77,8 @@ def test_a_sample_of_both_sides_is_compared(run, files) -> None:
     assert few.metrics.rejections["sim"]["not_drawn"] == 130
 
 
-def test_what_is_compared(whole) -> None:
-    metrics = whole.metrics
+def test_what_is_compared(found) -> None:
+    metrics = found.metrics
     assert "ranges of energy" in (metrics.ae_energy.missing or "ranges of energy")
     ranges = metrics.ae_details["survival by energy range"]
     assert ranges["Qbb"]["ren"].peak == 25
@@ -87,14 +90,14 @@ def test_what_is_compared(whole) -> None:
 
 
 @pytest.mark.thorough
-def test_every_figure_can_be_drawn(whole) -> None:
-    made = drawings(whole)
+def test_every_figure_can_be_drawn(found) -> None:
+    made = drawings(found)
     assert {"FEP mean pulse", "SEP superpulses", "SEP single pulse", "losses"} <= set(made)
     assert {"FEP cycle of simulation", "FEP cycle of data"} <= set(made)
     assert all(draw().axes for draw in made.values())
-    weights = {n: w for n, w in whole.run.weights.items() if not n.startswith("iren.")}
-    alone = whole.run.model_copy(update={"weights": weights})
-    made = drawings(dataclasses.replace(whole, run=alone))
+    weights = {n: w for n, w in found.run.weights.items() if not n.startswith("iren.")}
+    alone = found.run.model_copy(update={"weights": weights})
+    made = drawings(dataclasses.replace(found, run=alone))
     assert "losses" in made
     assert not any("cycle" in name for name in made)
 
@@ -128,14 +131,6 @@ def test_nothing_to_score_is_an_error(run, files, tmp_path) -> None:
     other = write(tmp_path / "other.lh5", {2030.0: 40}, 4, measured=True)
     with pytest.raises(CpunetError, match="no peak has pulses on both sides"):
         evaluate(run, files["sim"], other, baselines=False)
-
-
-@pytest.fixture(scope="module")
-def found(run, files, tmp_path_factory):
-    path = tmp_path_factory.mktemp("truth") / "truth.npz"
-    n = files["sim"].open().n_pulses
-    np.savez(path, response=records(n, np.random.default_rng(1), 4000.0).astype(np.float32))
-    return evaluate(run, files["sim"], files["data"], truth=path)
 
 
 @pytest.mark.thorough
