@@ -9,8 +9,8 @@ from itertools import pairwise
 import numpy as np
 from matplotlib.figure import Figure
 
-from cpunet.pulses.parameters import PARAMETERS, Values
-from cpunet.pulses.shape_parameters import A_OVER_E, data_axis
+from cpunet.pulses.parameters import Values
+from cpunet.pulses.shape_parameters import data_axis
 from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.evaluation import Evaluation
@@ -30,7 +30,6 @@ from cpunet.validation.run_figures import (
 
 SINGLE = ("raw", "rc", "rc_late", "ren", "truth")  # methods in the figure of a single pulse
 SLICED = ("data", "rc", "rc_late", "ren")  # and in slices
-MAIN_FIGURES = (A_OVER_E, "rise_time", "lq")  # further parameters with a figure of their own
 SHOWN = 10  # pulses in a figure of cycles, as in the paper
 
 Drawing = Callable[[], Figure]
@@ -40,8 +39,8 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
     """Functions that draw the figures of a validation, by name; they hold what they draw."""
     drawn: dict[str, Drawing] = {}
     metrics = evaluated.metrics
-    if peaks := metrics.held_out:
-        drawn["overlap with data"] = partial(overlap_figure, metrics, peaks)
+    if metrics.held_out:
+        drawn["overlap with data"] = partial(overlap_figure, metrics)
     if courses := metrics.ae_energy.methods:
         drawn["A over E and energy"] = partial(ae_energy_figure, courses)
     scored = [peak for peak in evaluated.sets if peak.values]
@@ -50,12 +49,10 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
         drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak.items()}
     ae = {p.name: {m: v["current_amplitude"] for m, v in p.values.items()} for p in scored}
     if DEP in ae and len(ae) > 1:
-        drawn["A over E survival"] = partial(roc_figure, ae, DEP)
-    fullest = max(
-        evaluated.sets, key=lambda peak: min(len(rows) for rows in peak.rows.values())
-    )
+        drawn["A over E survival"] = partial(roc_figure, ae)
     if any(name.startswith(f"{IREN.part}.") for name in evaluated.run.weights):
-        # pulses of both sides through both networks and back
+        # pulses of both sides of the fullest peak through both networks and back
+        fullest = max(evaluated.sets, key=lambda peak: min(map(len, peak.rows.values())))
         iren, ren = evaluated.run.iren, fullest.translations.ren
         for forward, back, side, names in (
             (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
@@ -82,9 +79,8 @@ def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
         by_method = {m: v[parameter] for m, v in values.items()}
         if not np.isfinite(data).any():
             continue
-        if parameter in (*PARAMETERS, *MAIN_FIGURES):
-            axis, compared = data_axis(data, bins), scores.judged[parameter]
-            how = (by_method, axis, parameter, name, compared)
+        if parameter in scores.judged:
+            how = (by_method, data_axis(data, bins), parameter, name, scores.judged[parameter])
             drawn[parameter.replace("_", " ")] = partial(parameter_histograms, *how)
         else:
             further[parameter] = by_method

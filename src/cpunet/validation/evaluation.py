@@ -86,16 +86,10 @@ def evaluate(
     require_same_sampling(sim_set, data_set)
     ren.require_sampling(f"{sim_set.path}:", sim_set.dt_ns)
     responses = None if truth is None else true_responses(truth, sim_set)
-    baseline_methods = fit_baseline_methods(
-        sim_set,
-        data_set,
-        parse_selection(trained_on, recipe.peaks),
-        recipe,
-        tails=ren.tails,
-        fitted=baselines,
-    )
-    translations = translate_all(ren, baseline_methods, sim_set, data_set, responses, seed)
-    sets = [PeakSets.of(n, parse_selection(n, recipe.peaks), translations) for n in names]
+    fit_on = parse_selection(trained_on, recipe.peaks)
+    fits = fit_baseline_methods(ren, sim_set, data_set, fit_on, fitted=baselines)
+    translations = translate_all(ren, fits, sim_set, data_set, responses, seed)
+    sets = [PeakSets.of(name, translations) for name in names]
     dep = next((peak.rows for peak in sets if peak.name == DEP), {})
     amplitudes, energy_kev = translations.amplitudes, translations.energy_kev
     scales = dep_scales({m: amplitudes[m][rows] for m, rows in dep.items()}, seed)
@@ -142,8 +136,8 @@ def evaluate(
         ),
         a_over_e_scale=scales,
         baseline_methods={
-            "fits": {name: of.describe() for name, of in baseline_methods.methods.items()},
-            "missing": baseline_methods.missing,
+            "fits": {name: of.describe() for name, of in fits.methods.items()},
+            "missing": fits.missing,
         },
         training={"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},

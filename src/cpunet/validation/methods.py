@@ -24,7 +24,7 @@ import numpy.typing as npt
 
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise
+from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import Finished, finish
 from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.electronics.superpulses import BASELINE_METHODS
@@ -36,7 +36,6 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.recipes.schema import Recipe
 from cpunet.translation.forms import wanted_tails
 from cpunet.translation.options import LEARNED
 from cpunet.translation.translator import REN
@@ -159,26 +158,18 @@ class FittedBaselineMethods:
 
 
 def fit_baseline_methods(
-    sim: InputSet,
-    data: InputSet,
-    fit_on: EnergySelection,
-    recipe: Recipe,
-    *,
-    tails: DrawnTails | None = None,
-    fitted: bool,
+    ren: REN, sim: InputSet, data: InputSet, fit_on: EnergySelection, *, fitted: bool
 ) -> FittedBaselineMethods:
     """Fit every baseline method to unpaired pulses.
 
     Parameters
     ----------
+    ren
+        REN, whose recipe and pile-up tails the methods share.
     sim, data
         All prepared pulses of both sides.
     fit_on
         Energies on which the methods are fitted: those of the training.
-    recipe
-        Recipe of the run.
-    tails
-        Pile-up tails as learned by the run.
     fitted
         Whether to fit the methods; the noise is measured in any case, for the truth.
 
@@ -187,7 +178,7 @@ def fit_baseline_methods(
     FittedBaselineMethods
         Methods that cannot be fitted are listed as missing, with the reason.
     """
-    result = FittedBaselineMethods()
+    result, tails = FittedBaselineMethods(), ren.tails
     if tails is not None and tails.law.rate_khz <= 0:
         tails = None
     try:
@@ -202,7 +193,7 @@ def fit_baseline_methods(
         stage("Fitting baseline methods", len(kinds)) as bar,
         ThreadPoolExecutor(usable_cores()) as pool,
     ):
-        how = (fit_sim, fit_data, sim.dt_ns, recipe.preparation.samples_before)
+        how = (fit_sim, fit_data, sim.dt_ns, ren.recipe.preparation.samples_before)
         fits = {name: pool.submit(kind, *how) for name, kind in kinds.items()}
         for name, fit in fits.items():
             try:

@@ -38,7 +38,7 @@ from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum
-from cpunet.pulses.peaks import EnergySelection
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
 from cpunet.pulses.two_sample import TwoSample, classifier_auc
 from cpunet.training.closed_forms import error_ends
@@ -162,8 +162,9 @@ class PeakSets:
     moved: dict[str, Values] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, name: str, chosen: EnergySelection, translations: Translations) -> Self:
+    def of(cls, name: str, translations: Translations) -> Self:
         """Select the pulses of a peak, of both sides and of the translations."""
+        chosen = parse_selection(name, translations.ren.recipe.peaks)
         rows = {
             method: np.flatnonzero(chosen.select(translations.energy_kev[method]) & whole)
             for method, whole in translations.whole.items()

@@ -36,8 +36,9 @@ from cpunet.plotting import (
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import LABELLED, data_axis
+from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import REFERENCE_KEV, Course, columns
-from cpunet.validation.comparisons import Compared, histogram
+from cpunet.validation.comparisons import Compared, finite_values, histogram
 from cpunet.validation.metrics import QUANTITIES, Metrics
 from cpunet.validation.noise import Spectrum
 from cpunet.validation.peaks import BEFORE_NS, MeanPulse
@@ -156,16 +157,15 @@ def sigma_panel(axes: Axes) -> None:
 
 
 @styled
-def overlap_figure(metrics: Metrics, peaks: Sequence[str]) -> Figure:
+def overlap_figure(metrics: Metrics) -> Figure:
     """Overlap with the data by quantity and method, and that of data with data as a band.
 
     Parameters
     ----------
     metrics
-        Content of ``metrics.json``.
-    peaks
-        Peaks, a panel each.
+        Content of ``metrics.json``; held-out peaks have a panel each.
     """
+    peaks = metrics.held_out
     figure, (grid,) = panels((1.2 + 4.2 * len(peaks), 3.6), 1, len(peaks), sharey=True)
     for axes, peak in zip(grid, peaks, strict=True):
         scores = metrics.peaks[peak]
@@ -351,7 +351,7 @@ def nearest(aligned: FloatArray, target: FloatArray) -> tuple[int, float]:
 
 
 @styled
-def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figure:
+def roc_figure(ae: Mapping[str, Mapping[str, Values]]) -> Figure:
     """Survival of other peaks after low-A/E cuts, against the survival of the DEP.
 
     Parameters
@@ -359,25 +359,21 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     ae
         A/E of single pulses by peak and method, the measured ones under ``"data"``;
         non-finite values are left out.
-    dep
-        Name of the peak of single-site events.
     """
-    others = [peak for peak in ae if peak != dep]
-    methods = [m for m in ae[dep] if all(m in ae[peak] for peak in others)]
+    others = [peak for peak in ae if peak != DEP]
+    methods = [m for m in ae[DEP] if all(m in ae[peak] for peak in others)]
     size = (3.4 * len(others) + 0.6, 3.8)
     figure, (grid,) = panels(size, 1, len(others), sharey=True)
     accepted = np.linspace(0.0, 1.0, ROC_POINTS)
     for axes, peak in zip(grid, others, strict=True):
         for method in sorted(methods, key=lambda name: name == "ren"):
-            single, other = (
-                ae[name][method][np.isfinite(ae[name][method])] for name in (dep, peak)
-            )
+            single, other = (finite_values(ae[name][method]) for name in (DEP, peak))
             if not (single.size and other.size):
                 continue
             cuts = np.quantile(single, 1 - accepted)
             left = 1 - np.searchsorted(np.sort(other), cuts) / other.size
             line(axes, 100 * accepted, 100 * left, method, label(method))
-        axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
+        axes.set(xlabel=f"{DEP} that survives [%]", title=peak, xlim=ROC_RANGE)
     # useful cuts leave few multi-site events
     grid[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
     grid[0].yaxis.set_major_formatter("{x:g}")
