@@ -26,13 +26,7 @@ from pydantic import Field
 
 from cpunet.pulses.parameters import Values
 from cpunet.validation.bootstraps import resampled_quantiles
-from cpunet.validation.comparisons import (
-    ByMethod,
-    Missing,
-    Number,
-    Result,
-    finite_values,
-)
+from cpunet.validation.comparisons import ByMethod, Missing, Number, Result, finite_values
 
 Range = tuple[float, float]
 Spread = tuple[float, float]  # a number and its error

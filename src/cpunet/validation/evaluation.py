@@ -22,11 +22,7 @@ from cpunet.training.run import Run, resolve_device
 from cpunet.translation.translator import REN
 from cpunet.validation.a_over_e import DEP, Range, dep_scales, survivals
 from cpunet.validation.ae_energy import against_energy
-from cpunet.validation.methods import (
-    fit_baseline_methods,
-    translate_all,
-    true_responses,
-)
+from cpunet.validation.methods import fit_baseline_methods, translate_all, true_responses
 from cpunet.validation.metrics import Metrics
 from cpunet.validation.peaks import PeakSets, fit_ends, score_peak
 
@@ -142,10 +138,7 @@ def evaluate(
         training={"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
         tails=None if tails is None else tails.model_dump(exclude_unset=True),
-        rejections={
-            "sim": sim_set.prepared.rejections,
-            "data": data_set.prepared.rejections,
-        },
+        rejections={"sim": sim_set.prepared.rejections, "data": data_set.prepared.rejections},
     )
     return Evaluation(run, sets, metrics)
 

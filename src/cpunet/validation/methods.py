@@ -285,10 +285,7 @@ def translate_all(
     noisy, squares = (defaultdict[str, list[Any]](list) for _ in range(2))
     comparable: list[Flags] = []
     truth: list[FloatArray] = []
-    with (
-        stage("Translating", len(pulses)) as bar,
-        ThreadPoolExecutor(usable_cores()) as pool,
-    ):
+    with stage("Translating", len(pulses)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         for rows in blocks(len(pulses)):
             block = pulses[rows]
             done = [

@@ -63,10 +63,7 @@ class Spectrum(Result):
 
 
 def baseline_spectra(
-    windows: Mapping[str, FloatArray],
-    begins: Mapping[str, Values],
-    samples: int,
-    dt_ns: float,
+    windows: Mapping[str, FloatArray], begins: Mapping[str, Values], samples: int, dt_ns: float
 ) -> dict[str, Spectrum]:
     """Compare the baseline noise of each method with that of the data.
 

@@ -30,9 +30,7 @@ if TYPE_CHECKING:
 
 METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
 REPORT = FolderKind(
-    name="report",
-    command="cpunet validate",
-    own=r"metrics\.json|report\.html|parameters\.npz",
+    name="report", command="cpunet validate", own=r"metrics\.json|report\.html|parameters\.npz"
 )
 # methods of the printed table, in the order of the page; those without noise are in the metrics
 _METHODS = ("raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
