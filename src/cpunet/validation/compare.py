@@ -302,14 +302,11 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
         cells["classifier: AUC"] = tested.auc, tested.auc_std, text, off
     if method in scores.paired and (edge := scores.paired[method].edge_rmse) is not None:
         cells["edge RMSE [10⁻³]"] = 1e3 * edge, None, f"{1e3 * edge:#.3g}", edge
-    differences = {
-        f"{QUANTITIES[name]} minus data [{LABELLED[name].unit}]".removesuffix(" []"): (
-            scores.judged[name].shift.get(method),
-            scores.judged[name].shift_std.get(method),
-        )
-        for name in MAIN
-        if name in scores.judged
-    }
+    differences = {}
+    for name in (name for name in MAIN if name in scores.judged):
+        compared, unit = scores.judged[name], LABELLED[name].unit
+        title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
+        differences[title] = compared.shift.get(method), compared.shift_std.get(method)
     if (row := metrics.survival.get(peak)) is not None:
         title = "A/E survival minus data [points]"
         differences[title] = row.difference.get(method), row.difference_std.get(method)

@@ -173,21 +173,16 @@ def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
         run.started[:10],
     )
     legend = re.match(r"l\d+-(p\d\d)-(r\d{3})-", data.path.name)
+    # places of files do not depend on where a study is stored
     facts = {
         "detector": sim.detector,
         "channel": data.read_as.get("table"),
         "period": legend and f"{legend[1]} {legend[2]}",
-    }
-    compared = {name: str(value) for name, value in facts.items() if value is not None}
-    compared |= {
-        # which do not depend on where a study is stored
-        **{
-            name: "/".join(side.path.absolute().parts[-2:])
-            for name, side in (("simulation", sim), ("data", data))
-        },
+        "simulation": "/".join(sim.path.absolute().parts[-2:]),
+        "data": "/".join(data.path.absolute().parts[-2:]),
         "run": Path(run.name).absolute().name,
         "trained": ", ".join(filter(None, training)),
+        "fit": run.fit and run.fit.verdict,
+        "scored with": f"cpunet {cpunet.__version__}",
     }
-    if run.fit is not None and run.fit.verdict:
-        compared["fit"] = run.fit.verdict
-    return compared | {"scored with": f"cpunet {cpunet.__version__}"}
+    return {name: str(value) for name, value in facts.items() if value}
