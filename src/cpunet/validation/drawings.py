@@ -105,6 +105,6 @@ def _single_pulse(peak: PeakSets) -> Drawing | None:
             shapes = {"data": around_half(data[[place]], dt_ns)[0]} | shapes
             pulses = {m: MeanPulse(s, np.full(len(s), np.nan), 1) for m, s in shapes.items()}
             title = f"{peak.name}: a simulated pulse without noise, and the measured pulse\n"
-            title += f"run_figures.nearest to its REN translation (RMS difference {rms:.4f})"
+            title += f"nearest to its REN translation (RMS difference {rms:.4f})"
             return partial(run_figures.shape_figure, {"": pulses}, dt_ns, title)
     return None
