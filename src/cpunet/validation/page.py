@@ -13,7 +13,7 @@ from pathlib import Path
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from cpunet.html_pages import asset, figure_html, joined, rendered
+from cpunet.html_pages import asset, figure_html, rendered
 from cpunet.plotting import COLOURS, label
 from cpunet.progress import stage
 from cpunet.pulses.shape_parameters import LABELLED
@@ -80,7 +80,7 @@ def write_page(
             placed[place][name] = figure_html(caption, draw(), folder / f"{stem}.svg", shows)
             bar.update(1)
     # of each method that is drawn, for the page's legend
-    drawn = joined(html for of_place in placed.values() for html in of_place.values())
+    drawn = "".join(html for of_place in placed.values() for html in of_place.values())
     methods = dict.fromkeys(re.findall('data-method="([^"]*)"', drawn))
     # of mean pulses and noise a few, preferably of peaks that took no part in the training
     peak = str(metrics.training.get("peak"))
