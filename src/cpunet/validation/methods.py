@@ -181,8 +181,9 @@ def fit_baseline_methods(
     result, tails = FittedBaselineMethods(), ren.tails
     if tails is not None and tails.law.rate_khz <= 0:
         tails = None
+    measured_tails = None if tails is None else tails_of(data)[0]
     try:
-        noise = noise_of(data, None if tails is None else tails_of(data)[0])
+        noise = noise_of(data, measured_tails)
         result.noise = noise if tails is None else TraceNoise(noise, tails)
     except CpunetError as error:
         result.missing["noise"] = str(error)
