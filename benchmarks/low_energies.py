@@ -36,7 +36,7 @@ def main() -> None:
     ren, recipe, selection = REN.of(run), run.recipe, parse_selection("100-1000", {})
     sim = load_pulses(PulseFile(given.stand / "sim.lh5"), "simulated", recipe, selection)
     data = load_pulses(PulseFile(given.stand / "data.lh5"), "measured", recipe, selection)
-    noise = fit_baseline_methods(sim, data, selection, recipe, tails=ren.tails, fitted=False)
+    noise = fit_baseline_methods(ren, sim, data, selection, fitted=False)
     known = true_responses(given.stand / "truth.npz", sim)
     noisy = translate_all(ren, noise, sim, data, known, SEED)
     clean = current_amplitude(ren.apply(sim.prepared.pulses.waveforms, noise=False), ren.dt_ns)

@@ -8,7 +8,6 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Iterable
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -56,11 +55,6 @@ def part(name: str, *values: Any, **named: Any) -> Markup:
     """
     macro = getattr(_environment().get_template("parts.html").module, name)
     return Markup(macro(*values, **named))
-
-
-def joined(parts: Iterable[str]) -> Markup:
-    """Join pieces of a page, one per line."""
-    return Markup("\n").join(parts)
 
 
 def figure_html(

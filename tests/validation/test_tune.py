@@ -5,29 +5,18 @@ from __future__ import annotations
 import csv
 import re
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
-from cpunet.pulses.loading import load_pulses
-from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
+from cpunet.training.job import TrainingJob
 from cpunet.translation.translator import REN
 from cpunet.validation.tune import HeldOut, own_values, tune
 from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files
-
-TINY = [
-    *SMALL_NETWORK,
-    "discriminator.samples_per_step=80",
-    "training.iterations=4",
-    "scores.bootstraps=10",
-]
-
-
-def tiny(*more: str) -> Recipe:
-    return load_recipe("published", [*TINY, *more])
 
 
 @pytest.fixture(scope="module")
@@ -36,24 +25,22 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     return write_files(tmp_path_factory.mktemp("files"), np.repeat(KEV[:2], [90, 10]))
 
 
-def held_out(files: Files, recipe: Recipe, seed: int = 0) -> HeldOut:
-    selection = parse_selection("FEP", recipe.peaks)
-    sim = load_pulses(files.sim, "simulated", recipe, selection)
-    data = load_pulses(files.data, "measured", recipe, selection)
-    return HeldOut.of(sim, data, recipe, seed)
+def held_out(files: Files, *settings: str, seed: int = 0) -> HeldOut:
+    recipe = load_recipe("fast", settings)
+    return HeldOut.of(TrainingJob.of(files, recipe, "FEP", seed=seed, device="cpu"))
 
 
 def test_held_out_pulses_are_of_the_peak_and_in_no_training(files):
-    parts = held_out(files, tiny())
-    for side, held in ((parts.fit_sim, parts.sim), (parts.fit_data, parts.data)):
+    parts = held_out(files)
+    for side, held in ((parts.job.sim, parts.sim), (parts.job.data, parts.data)):
         fit = side.prepared.pulses
         events = {*fit.event_number.tolist()}, {*held.event_number.tolist()}
         assert not events[0] & events[1]
         assert len(held) == int(0.3 * (len(fit) + len(held)))
         assert (held.energy_kev == 2614.511).all()
-    other = held_out(files, tiny(), seed=1)
+    other = held_out(files, seed=1)
     assert set(other.sim.event_number) != set(parts.sim.event_number)
-    few = tiny("peaks={FEP: {energy_kev: 2103.511, half_width_kev: 5}}")
+    few = "peaks={FEP: {energy_kev: 2103.511, half_width_kev: 5}}"
     with pytest.raises(CpunetError, match=r"sim\.lh5: 10 pulses, of which 3 would be held out"):
         held_out(files, few)
 
@@ -63,33 +50,28 @@ class Giving(REN):
 
     tails = None
 
-    def __init__(self, windows: np.ndarray, recipe: Recipe) -> None:
-        self.windows, self.recipe = windows, recipe
+    def __init__(self, windows: np.ndarray) -> None:
+        self.windows, self.recipe = windows, load_recipe("fast")
 
     def apply(self, *_: Any, **__: Any) -> Any:
         return self.windows
 
 
 def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
-    recipe = tiny("scores.bootstraps=100")
-    parts = held_out(files, recipe)
-    alike = parts.score(
-        Giving(parts.fit_data.prepared.pulses.waveforms[: len(parts.data)], recipe)
-    )
-    assert 0.3 < alike < 2
-    assert parts.score(Giving(parts.data.waveforms, recipe)) == 0
-    assert parts.score(Giving(parts.sim.waveforms, recipe)) > 10
+    parts = held_out(files)
+    alike = parts.job.data.prepared.pulses.waveforms[: len(parts.data)]
+    assert 0.3 < parts.score(Giving(alike)) < 2
+    assert parts.score(Giving(parts.data.waveforms)) == 0
+    assert parts.score(Giving(parts.sim.waveforms)) > 10
     lost = parts.data.waveforms.copy()
     lost[:3] = np.nan
     with pytest.raises(CpunetError, match="% of the held-out pulses have no translation"):
-        parts.score(Giving(lost, recipe))
+        parts.score(Giving(lost))
 
 
 optuna = pytest.importorskip("optuna")
-Choice, Real = (
-    optuna.distributions.CategoricalDistribution,
-    optuna.distributions.FloatDistribution,
-)
+Choice = optuna.distributions.CategoricalDistribution
+Real = optuna.distributions.FloatDistribution
 
 
 @pytest.mark.parametrize(
@@ -108,17 +90,18 @@ def test_what_cannot_be_searched_is_named(space, words):
         own_values(load_recipe("fast"), space)
 
 
-class Scored:
+@pytest.fixture
+def tried(monkeypatch) -> list[float]:
     """Trainings that cost nothing: the score is near the setting that is best."""
+    tried: list[float] = []
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        self.tried: list[Any] = []
-        monkeypatch.setattr(HeldOut, "train", lambda _self, recipe, *_: recipe)
-        monkeypatch.setattr(HeldOut, "score", lambda _self, recipe: self.score(recipe))
+    def score(_self: Any, recipe: Recipe) -> float:
+        tried.append(recipe.training.level_ns)
+        return 1 + abs(tried[-1] - 1000)
 
-    def score(self, recipe: Any) -> float:
-        self.tried.append(recipe.training.level_ns)
-        return 1 + abs(recipe.training.level_ns - 1000)
+    monkeypatch.setattr(HeldOut, "train", lambda _self, recipe: recipe)
+    monkeypatch.setattr(HeldOut, "score", score)
+    return tried
 
 
 FIT = {
@@ -127,29 +110,22 @@ FIT = {
 }
 
 
-@pytest.fixture
-def scored(monkeypatch) -> Scored:
-    return Scored(monkeypatch)
-
-
 def states(study: Any) -> list[str]:
     return [trial.state.name for trial in study.trials]
 
 
-def test_a_search_goes_on_in_its_folder_and_is_the_same_with_the_same_seed(
-    files, scored, tmp_path
-):
+def test_a_search_goes_on_and_is_the_same_with_the_same_seed(files, tried, tmp_path):
     recipe, out = load_recipe("fast", ["training.before_ns=2000"]), tmp_path / "tune"
     study = tune(*files, out, FIT, recipe=recipe, trials=2)
     own = {"training.level_ns": recipe.training.level_ns, "training.before_ns": 2000}
     assert study.trials[0].params == own
     tune(*files, out, FIT, recipe=recipe, trials=10)
-    assert len(scored.tried) == 10
+    assert len(tried) == 10
     again = tune(*files, out, FIT, recipe=recipe, trials=10)
-    assert len(scored.tried) == 10
+    assert len(tried) == 10
     assert states(again) == ["COMPLETE"] * 10
     tune(*files, tmp_path / "other", FIT, recipe=recipe, trials=4)
-    assert scored.tried[10:] == scored.tried[:4]
+    assert tried[10:] == tried[:4]
 
     with (out / "trials.csv").open() as stream:
         rows = [*csv.DictReader(stream)]
@@ -163,40 +139,33 @@ def test_a_search_goes_on_in_its_folder_and_is_the_same_with_the_same_seed(
         tune(*files, out, FIT, recipe=recipe, trials=12, seed=1)
 
 
-def test_two_processes_share_a_search(files, scored, monkeypatch, tmp_path):
-    recipe, out, score = load_recipe("fast"), tmp_path / "tune", scored.score
+def test_two_processes_share_a_search(files, tried, monkeypatch, tmp_path):
+    recipe, out, score = load_recipe("fast"), tmp_path / "tune", HeldOut.score
 
-    def joined(changed: Any) -> float:
-        monkeypatch.setattr(scored, "score", score)
+    def joined(*trial: Any) -> float:
+        monkeypatch.setattr(HeldOut, "score", score)
         tune(*files, out, FIT, recipe=recipe, trials=3)  # while the first trial of another runs
-        return score(changed)
+        return score(*trial)
 
-    monkeypatch.setattr(scored, "score", joined)
+    monkeypatch.setattr(HeldOut, "score", joined)
     study = tune(*files, out, FIT, recipe=recipe, trials=3)
     assert states(study) == ["COMPLETE"] * 4
-    assert len(set(scored.tried)) == 4
+    assert len(set(tried)) == 4
 
 
 @pytest.mark.parametrize("error", [CpunetError("the chain is lost"), SystemExit(130)])
 def test_a_failed_trial_counts_and_an_interrupted_one_does_not(
-    files, scored, monkeypatch, tmp_path, error
+    files, tried, monkeypatch, tmp_path, error
 ):
     recipe, out = load_recipe("fast"), tmp_path / "tune"
-
-    def fail(*_: Any) -> float:
-        raise error
-
     with monkeypatch.context() as patch:
-        patch.setattr(scored, "score", fail)
+        patch.setattr(HeldOut, "score", Mock(side_effect=error))
         with pytest.raises(type(error), match=r"no trial has a score; the first: the|130"):
             tune(*files, out, FIT, recipe=recipe, trials=1)
     study = tune(*files, out, FIT, recipe=recipe, trials=2)
-    assert states(study) == (
-        ["FAIL", "COMPLETE"]
-        if isinstance(error, CpunetError)
-        else ["RUNNING", "COMPLETE", "COMPLETE"]
-    )
-    assert len(scored.tried) == len(study.trials) - 1
+    first = ["FAIL"] if isinstance(error, CpunetError) else ["RUNNING", "COMPLETE"]
+    assert states(study) == [*first, "COMPLETE"]
+    assert len(tried) == len(study.trials) - 1
 
 
 @pytest.mark.thorough
@@ -208,6 +177,8 @@ def test_networks_are_searched(files, tmp_path, monkeypatch):
 
     monkeypatch.setattr(PositionalUNet, "forward", near_the_input)
     space = {"generator.width": Choice([2, 4]), "training.rate_generators": Real(1e-4, 1e-2)}
-    study = tune(*files, tmp_path / "tune", space, recipe=tiny(), trials=2)
+    few = ["discriminator.samples_per_step=80", "training.iterations=4", "scores.bootstraps=10"]
+    recipe = load_recipe("published", [*SMALL_NETWORK, *few])
+    study = tune(*files, tmp_path / "tune", space, recipe=recipe, trials=2)
     assert states(study) == ["COMPLETE"] * 2
     assert (tmp_path / "tune" / "best.yaml").is_file()

@@ -22,27 +22,22 @@ from cpunet.validation.methods import pair_squares, scores_of_squares
 from cpunet.validation.validate import validate
 from synthetic import after_pole, decay, leave_undrawn, load_recipe, phased_edges, write_pulses
 
-RECIPE = load_recipe(
-    "fast",
-    [
-        "scores.bootstraps=10",
-        "generator.poles_ns=[60]",  # what a fit cannot follow takes long to be looked for
-    ],
-)
+# more poles than these pulses have take long to be looked for
+RECIPE = load_recipe("fast", ["scores.bootstraps=10", "generator.poles_ns=[60]"])
 KEV = {"FEP": 2614.511, "SEP": 2103.511, "DEP": 1592.511}
 
 
-def records(n: int, rng: np.random.Generator, tau: float | None) -> np.ndarray:
-    """Edges of various widths at sample 450 of 1100, behind a pole and a decay if measured."""
-    pulses = phased_edges(n, rng, 450, 1100)
-    return pulses if tau is None else after_pole(pulses, 4.0, 60) * decay(450, tau, 1100)
+def measured_shape(simulated: np.ndarray) -> np.ndarray:
+    return after_pole(simulated, 4.0, 60) * decay(450, 4000.0, 1100)
 
 
 def write(path: Path, counts: dict[float, int], seed: int, *, measured: bool) -> PulseFile:
+    """Edges of various widths, behind a pole and a decay if measured."""
     rng = np.random.default_rng(seed)
     kev = np.repeat(list(counts), list(counts.values())).astype(float)
-    waveforms = records(len(kev), rng, 4000.0 if measured else None)
+    waveforms = phased_edges(len(kev), rng, 450, 1100)
     if measured:
+        waveforms = measured_shape(waveforms)
         noise = rng.normal(0, 2.0, waveforms.shape)
         waveforms = np.round(1000 + 10 * kev[:, None] * waveforms + 10 * noise)
     write_pulses(path, Pulses.of(waveforms, dt_ns=16, energy_kev=kev), table="geds/raw")
@@ -66,13 +61,12 @@ def run(files, tmp_path_factory) -> Run:
     return train(files["sim"], files["data"], out, recipe=RECIPE, seed=0, device="cpu")
 
 
-def evaluated(run: Run, sim: PulseFile, data: PulseFile) -> Evaluation:
-    return evaluate(run, sim, data, baselines=False)
-
-
 @pytest.fixture(scope="module")
-def whole(run, files) -> Evaluation:
-    return evaluated(run, files["sim"], files["data"])
+def found(run, files, tmp_path_factory) -> Evaluation:
+    path = tmp_path_factory.mktemp("truth") / "truth.npz"
+    n, rng = files["sim"].open().n_pulses, np.random.default_rng(1)
+    np.savez(path, response=measured_shape(phased_edges(n, rng, 450, 1100)).astype(np.float32))
+    return evaluate(run, files["sim"], files["data"], truth=path)
 
 
 @pytest.mark.thorough
@@ -83,8 +77,8 @@ def test_a_sample_of_both_sides_is_compared(run, files) -> None:
     assert few.metrics.rejections["sim"]["not_drawn"] == 130
 
 
-def test_what_is_compared(whole) -> None:
-    metrics = whole.metrics
+def test_what_is_compared(found) -> None:
+    metrics = found.metrics
     assert "ranges of energy" in (metrics.ae_energy.missing or "ranges of energy")
     ranges = metrics.ae_details["survival by energy range"]
     assert ranges["Qbb"]["ren"].peak == 25
@@ -96,12 +90,16 @@ def test_what_is_compared(whole) -> None:
 
 
 @pytest.mark.thorough
-def test_every_figure_can_be_drawn(whole) -> None:
-    made = drawings(whole)
+def test_every_figure_can_be_drawn(found) -> None:
+    made = drawings(found)
     assert {"FEP mean pulse", "SEP superpulses", "SEP single pulse", "losses"} <= set(made)
     assert {"FEP cycle of simulation", "FEP cycle of data"} <= set(made)
-    for drawing in made.values():
-        assert drawing().axes
+    assert all(draw().axes for draw in made.values())
+    weights = {n: w for n, w in found.run.weights.items() if not n.startswith("iren.")}
+    alone = found.run.model_copy(update={"weights": weights})
+    made = drawings(dataclasses.replace(found, run=alone))
+    assert "losses" in made
+    assert not any("cycle" in name for name in made)
 
 
 def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) -> None:
@@ -132,15 +130,7 @@ def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkey
 def test_nothing_to_score_is_an_error(run, files, tmp_path) -> None:
     other = write(tmp_path / "other.lh5", {2030.0: 40}, 4, measured=True)
     with pytest.raises(CpunetError, match="no peak has pulses on both sides"):
-        evaluated(run, files["sim"], other)
-
-
-@pytest.fixture(scope="module")
-def found(run, files, tmp_path_factory):
-    path = tmp_path_factory.mktemp("truth") / "truth.npz"
-    n = files["sim"].open().n_pulses
-    np.savez(path, response=records(n, np.random.default_rng(1), 4000.0).astype(np.float32))
-    return evaluate(run, files["sim"], files["data"], truth=path)
+        evaluate(run, files["sim"], other, baselines=False)
 
 
 @pytest.mark.thorough
@@ -151,7 +141,7 @@ def test_scores_of_pairs_are_those_of_the_windows_without_noise(found):
     each = [translations.without_noise(row) for row in rows]
     windows = {method: np.concatenate([one[method] for one in each]) for method in each[0]}
     assert set(windows) == {"raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth"}
-    scores = peak.paired_scores()
+    scores = found.metrics.peaks[peak.name].paired
     squares = pair_squares(windows, windows["truth"], found.run.recipe.scores.edge_samples)
     for method, score in scores.items():
         direct = scores_of_squares(squares[method])
@@ -162,33 +152,13 @@ def test_scores_of_pairs_are_those_of_the_windows_without_noise(found):
 def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     peak = found.sets[0]
     pulses = {method: peak.windows(method) for method in peak.rows}
-    assert list(pulses) == [
-        "data",
-        "raw",
-        "rc",
-        "rc_late",
-        "gauss_exp",
-        "superpulse",
-        "ren",
-        "truth",
-    ]
-    raw = peak.rows["raw"]
+    names = ("data", "raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth")
+    assert tuple(pulses) == names
+    raw, of = peak.rows["raw"], peak.translations
     assert all(len(p) == len(raw) for m, p in pulses.items() if m != "data")
-    again = peak.translations.ren.apply(
-        peak.translations.windows["raw"],
-        energy_kev=peak.translations.energy_kev["raw"],
-        generator=np.random.default_rng(0),
-    )
+    how = {"energy_kev": of.energy_kev["raw"], "generator": np.random.default_rng(0)}
+    again = of.ren.apply(of.windows["raw"], **how)
     np.testing.assert_array_equal(pulses["ren"], again[raw])
-
-
-def test_a_run_of_ren_alone_is_drawn_without_cycles(whole) -> None:
-    weights = {n: w for n, w in whole.run.weights.items() if not n.startswith("iren.")}
-    made = drawings(
-        dataclasses.replace(whole, run=whole.run.model_copy(update={"weights": weights}))
-    )
-    assert "losses" in made
-    assert not any("cycle" in name for name in made)
 
 
 @pytest.fixture(scope="module")

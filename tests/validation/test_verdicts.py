@@ -10,40 +10,28 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 
-import cpunet
 from cpunet.pulses.two_sample import TwoSample
 from cpunet.validation.comparisons import Missing, compare, two_sample_test
 from cpunet.validation.metrics import ALARM, Metrics, Verdict
 from cpunet.validation.noise import Spectrum
 from synthetic import load_recipe
 
-STANDS = 12
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 60})
 
 
-def one(p: float, shift: float = 5.0) -> dict[str, Any]:
-    """A parameter whose mean differs by a shift ± 2."""
-    return {
-        "iou": {"ren": 80.0, "ceiling": 85.9},
-        "mean": 500.0,
-        "shift": {"ren": shift},
-        "shift_std": {"ren": 2.0},
-        "p": {"ren": p},
-    }
+def one(p: float) -> dict[str, Any]:
+    """A parameter whose mean differs by 5 ± 2."""
+    of_ren = {"shift": {"ren": 5.0}, "shift_std": {"ren": 2.0}, "p": {"ren": p}}
+    return {"iou": {"ren": 80.0, "ceiling": 85.9}, "mean": 500.0} | of_ren
 
 
 def metrics() -> Metrics:
     auc = TwoSample(0.51, 0.02, 0.5, 0.02, 500, 500, 0, 0)
     survival = {"difference": {"ren": -9.5}, "difference_std": {"ren": 5.0}}
+    p = {"current_amplitude": 0.5, "drift_time": 1e-4, "tail_slope": 0.9}
+    parameters = {name: one(of_one) for name, of_one in p.items()}
     peaks = {
-        "SEP": {
-            "parameters": {
-                "current_amplitude": one(0.5),
-                "drift_time": one(1e-4),
-                "tail_slope": one(0.9),
-            },
-            "two_sample": {"ren": auc},
-        },
+        "SEP": {"parameters": parameters, "two_sample": {"ren": auc}},
         "DEP": {"parameters": {}, "missing": "3 measured pulses"},
     }
     rows = {"DEP": {"cut": {"ren": 0.07}}, "SEP": survival}
@@ -63,7 +51,7 @@ def test_too_good_to_be_chance_asks_for_the_same_events():
     words = Verdict(1 - 1e-6).words
     assert words == "closer than statistics permit: are the same events on both sides?"
     values = np.random.default_rng(1).normal(size=400)
-    assert Verdict(two_sample_test(values, values).p).words == words
+    assert Verdict(two_sample_test(values, values)[2]).words == words
 
 
 def test_the_table_holds_every_quantity_and_is_json():
@@ -73,8 +61,7 @@ def test_the_table_holds_every_quantity_and_is_json():
     assert table["DEP"] == {}
     sep = table["SEP"]["ren"]
     assert list(table["SEP"]) == ["ren"]  # and not the data
-    names = ["current_amplitude", "drift_time", "tail_slope", "auc", "ae_survival"]
-    assert list(sep) == names
+    assert [*sep] == ["current_amplitude", "drift_time", "tail_slope", "auc", "ae_survival"]
     assert sep["drift_time"]["words"] == "off by 3.9 sigma"
     assert sep["current_amplitude"]["numbers"] == "+1.00 ± 0.40 %"
     assert sep["auc"]["p"] == pytest.approx(0.31, abs=0.01)
@@ -112,17 +99,12 @@ def test_noise_that_differs_is_said():
     assert "noise not judged (7 baselines; 10 are needed)" in changed.summary("SEP")
 
 
-def test_the_summary_quotes_the_worst_first():
-    changed = metrics()
-    tested = changed.peaks["SEP"].two_sample
-    tested["ren"] = replace(tested["ren"], auc=0.7)
-    line = changed.summary("SEP")
-    assert line.index("classifier off") < line.index("drift time off") < line.index("agreement")
-
-
-def test_what_is_not_scored_says_why():
+def test_the_summary_quotes_the_worst_first_and_says_why_others_are_not_scored():
     changed = metrics()
     sep = changed.peaks["SEP"]
+    sep.two_sample["ren"] = replace(sep.two_sample["ren"], auc=0.7)
+    line = changed.summary("SEP")
+    assert line.index("classifier off") < line.index("drift time off") < line.index("agreement")
     sep.two_sample["ren"] = Missing(missing="12 measured pulses are usable")
     sep.parameters["drift_time"].p = {"ren": None}
     changed.survival["SEP"].difference = {"ren": None}
@@ -145,28 +127,6 @@ def test_p_is_uniform_for_one_distribution_and_small_for_two():
     assert kstest(p, "uniform").pvalue > 0.01
     assert (p < ALARM).mean() <= 0.01
     assert max(found[name].p["shifted"] for name in names) < 0.01
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(3600)
-def test_p_of_the_truth_is_uniform_over_stands(tmp_path):
-    """What statistics alone explain agrees, and the simulation without electronics is off."""
-    few: dict[str, Any] = {"events": "FEP=700,SEP=300,DEP=300", "settings": ("step_ns=2",)}
-    names = ("ae_survival", "lq", "rise_time")
-    p: dict[str, list[float]] = {name: [] for name in names}
-    run = None
-    for seed in range(STANDS):
-        stand = cpunet.make_stand(tmp_path / f"stand{seed}", seed=seed, **few)
-        run = run or cpunet.train(stand.sim, stand.data)
-        report = cpunet.validate(run, stand.sim, stand.data, truth=stand.truth, baselines=False)
-        truth, raw = (report.metrics.judge("SEP", m) for m in ("truth", "raw"))
-        assert not raw["lq"].agrees
-        assert not raw["rise_time"].agrees
-        for name in names:
-            p[name].append(truth[name].p)
-    for name, values in p.items():
-        assert kstest(values, "uniform").pvalue > 0.01, (name, values)
-        assert min(values) > ALARM / 10, (name, values)
 
 
 def test_errors_of_a_fit_are_in_p_and_in_the_error_of_the_mean():

@@ -19,18 +19,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 from pydantic import Field
 
 from cpunet.pulses.parameters import Values
-from cpunet.validation.comparisons import (
-    ByMethod,
-    Missing,
-    Number,
-    Result,
-    resampled_quantiles,
-)
+from cpunet.validation.bootstraps import resampled_quantiles
+from cpunet.validation.comparisons import ByMethod, Missing, Number, Result, finite_values
 
 Range = tuple[float, float]
 Spread = tuple[float, float]  # a number and its error
@@ -161,7 +157,7 @@ def ae_survival(
     >>> round(cut, 6), round(peaks["SEP"][0], 2)
     (10.0, 90.91)
     """
-    dep = dep_ae[np.isfinite(dep_ae)]
+    dep = finite_values(dep_ae)
     if dep.size < MIN_EVENTS:
         return np.nan, np.nan, dict.fromkeys(others, (np.nan, np.nan))
     rng = np.random.default_rng(seed)
@@ -170,7 +166,7 @@ def ae_survival(
     cuts = resampled_quantiles(dep, 1 - ACCEPTANCE, bootstraps, rng)
     peaks: dict[str, Spread] = {}
     for name, values in others.items():
-        finite = np.sort(values[np.isfinite(values)])
+        finite = np.sort(finite_values(values))
         n, peaks[name] = finite.size, (np.nan, np.nan)
         if n:
             passing = n - int(np.searchsorted(finite, cut))
@@ -228,9 +224,14 @@ def survival_table(
             for m in methods
             if m != "data"
         }
-        row.of_fit = of_fit = (
-            _of_fit(moved[DEP], moved[name]) if {DEP, name} <= moved.keys() else 0.0
-        )
+        row.of_fit = of_fit = 0.0
+        ends = [moved[peak] for peak in (DEP, name) if peak in moved]
+        if len(ends) == 2 and min(np.isfinite(v).sum(axis=2).min() for v in ends) >= MIN_EVENTS:
+            quantile: Any = {"axis": 2, "keepdims": True, "method": "weibull"}
+            cuts = np.nanquantile(ends[0], 1 - ACCEPTANCE, **quantile)
+            percent = 100 * ((ends[1] >= cuts).sum(axis=2) / np.isfinite(ends[1]).sum(axis=2))
+            of_fit = float(np.sqrt((0.25 * (percent[:, 0] - percent[:, 1]) ** 2).sum()))
+            row.of_fit = of_fit
         if "ren" in survival:
             passed, error = survival["ren"]
             survival["ren"] = passed, float(np.hypot(error, of_fit))
@@ -264,33 +265,36 @@ def peak_survival(
     cut_std
         Error of the cut.
     """
-    finite = np.isfinite(amplitude)
-    in_peak, aside = (
-        np.any([(energy_kev >= low) & (energy_kev < high) for low, high in ranges], axis=0)
-        if ranges
-        else np.zeros(len(energy_kev), bool)
-        for ranges in ([peak], sidebands)
-    )
+    inside = [
+        np.concatenate(
+            [np.empty(0), *(amplitude[(energy_kev >= a) & (energy_kev < b)] for a, b in of)]
+        )
+        for of in ([peak], sidebands)
+    ]
+    events = [finite_values(values) for values in inside]
+    n, n_side = map(len, events)
     width = sum(high - low for low, high in sidebands)
     scale = (peak[1] - peak[0]) / width if width else 0.0
-    n, n_side = (int((finite & inside).sum()) for inside in (in_peak, aside))
-
-    def at(lowest: float) -> tuple[int, int, Spread]:
-        survives = finite & (amplitude >= lowest)
-        passing, side_pass = (int((survives & inside).sum()) for inside in (in_peak, aside))
-        return passing, side_pass, sideband_survival(passing, n, side_pass, n_side, scale)
-
-    passing, side_pass, (survival, std) = at(np.nan if cut is None else cut)
+    # survivors of the cut and, for its error, of those that are lower and higher by it
+    lowest, error = np.nan if cut is None else cut, cut_std or 0.0
+    survivors = [
+        [int((values >= lowest + by).sum()) for values in events] for by in (0.0, -error, error)
+    ]
+    (survival, std), (low, _), (high, _) = (
+        sideband_survival(passing, n, side_pass, n_side, scale)
+        for passing, side_pass in survivors
+    )
+    passing, side_pass = survivors[0]
     result = RangeSurvival(
         peak=n,
         peak_pass=passing,
         sideband=n_side,
         sideband_pass=side_pass,
         scale=scale,
-        undefined=int((~finite & (in_peak | aside)).sum()),
+        undefined=sum(map(len, inside)) - n - n_side,
     )
     span = f"from {peak[0]:g} to {peak[1]:g} keV"
-    if cut is None or not np.isfinite(cut):
+    if not np.isfinite(lowest):
         result.missing = "there is no cut: too few events of the double-escape peak"
     elif not n:
         result.missing = f"no events {span}"
@@ -299,10 +303,8 @@ def peak_survival(
     else:
         if not scale or not std:
             std = 100 * survival_error(passing, n)
-        if cut_std:
-            low, high = at(cut - cut_std)[2][0], at(cut + cut_std)[2][0]
-            std = float(np.hypot(std, 0.5 * (low - high)))
-        result.survival, result.survival_std = survival, std
+        result.survival = survival
+        result.survival_std = float(np.hypot(std, 0.5 * (low - high)))
     return result
 
 
@@ -375,7 +377,7 @@ def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, Spread]
     # half of SciPy, which those who only read scores need not wait for
     from cpunet.electronics.baseline_methods import most_frequent
 
-    finite = {method: values[np.isfinite(values)] for method, values in dep_ae.items()}
+    finite = {method: finite_values(values) for method, values in dep_ae.items()}
     if not all(values.size >= MIN_EVENTS for values in finite.values()):
         return {}
     scales = {}
@@ -386,19 +388,44 @@ def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, Spread]
     return scales
 
 
-def subtracted(
-    table: Mapping[str, SurvivalRow], ranges: Mapping[str, Mapping[str, RangeSurvival]]
-) -> dict[str, SurvivalRow]:
-    """The table with the background of lines subtracted, and with ranges of the continuum.
+def survivals(
+    ae: ByPeak,
+    moved: Mapping[str, Values],
+    amplitudes: Mapping[str, Values],
+    energy_kev: Mapping[str, Values],
+    bands: Mapping[str, tuple[Range, Sequence[Range]]],
+    seed: int,
+) -> tuple[dict[str, SurvivalRow] | Missing, dict[str, dict[str, RangeSurvival]] | Missing]:
+    """Survival of each peak, and of lines without their background and of continua.
 
     Parameters
     ----------
+    ae, moved, seed
+        See `survival_table`.
+    amplitudes, energy_kev
+        A/E and energies of all events by method.
+    bands
+        Range in keV and sidebands of lines and continua by name, see `peak_survival`.
+
+    Returns
+    -------
     table
-        Result of `survival_table`.
+        Result of `survival_table` with the background of lines subtracted, and with continua.
     ranges
-        Survival by range and method, see `peak_survival`.
+        Survival by range and method.
     """
-    rows = dict(table)
+    table = survival_table(ae, moved, seed=seed)
+    if isinstance(table, Missing):
+        return table, Missing(missing=f"there is no A/E cut: {table.missing}")
+    cuts, errors = table[DEP].cut, table[DEP].cut_std
+    ranges = {
+        name: {
+            m: peak_survival(amplitudes[m], energy_kev[m], cut, span, sidebands, errors[m])
+            for m, cut in cuts.items()
+        }
+        for name, (span, sidebands) in bands.items()
+        if name != DEP
+    }
     for name, methods in ranges.items():
         shares = {
             method: (of.survival, of.survival_std)
@@ -419,24 +446,12 @@ def subtracted(
                 for m, std in table[name].difference_std.items()
                 if m in shares and std is not None
             }
-        row = rows[name] = SurvivalRow(
+        row = table[name] = SurvivalRow(
             events={method: of.peak for method, of in methods.items()},
             missing={method: of.undefined for method, of in methods.items()},
         )
         row.compare(shares, spread)
-    return rows
-
-
-def _of_fit(dep: Values, other: Values) -> float:
-    """Error of a survival in percent from those of the fit, see `survival_table`."""
-    percent = np.zeros(dep.shape[:2])
-    for axis, end in np.ndindex(*percent.shape):
-        single, some = (v[axis, end][np.isfinite(v[axis, end])] for v in (dep, other))
-        if min(single.size, some.size) < MIN_EVENTS:
-            return 0.0
-        cut = np.quantile(single, 1 - ACCEPTANCE, method="weibull")
-        percent[axis, end] = 100 * (some >= cut).mean()
-    return float(np.sqrt((0.25 * (percent[:, 0] - percent[:, 1]) ** 2).sum()))
+    return table, ranges
 
 
 def null_spread(
@@ -456,17 +471,16 @@ def null_spread(
     rng
         Random generator.
     """
-    sets = [[v[np.isfinite(v)] for v in both] for both in (dep, other)]
+    sets = [[finite_values(v) for v in both] for both in (dep, other)]
     if min(v.size for v in sets[0]) < MIN_EVENTS or not all(v.size for v in sets[1]):
         return float("nan")
     unit = [np.median(v) for v in sets[0]]
     pooled = [np.concatenate([v / u for v, u in zip(both, unit, strict=True)]) for both in sets]
-    sizes = [both[0].size for both in sets]
     drawn = [[rng.permutation(v) for v in pooled] for _ in range(NULLS)]
-    divided = [
-        np.split(np.array(column), [n], axis=1)
-        for column, n in zip(zip(*drawn, strict=True), sizes, strict=True)
-    ]
+    divided = (
+        np.split(np.array(column), [both[0].size], axis=1)
+        for column, both in zip(zip(*drawn, strict=True), sets, strict=True)
+    )
     survival = []
     for single, some in zip(*divided, strict=True):
         cut = np.quantile(single, 1 - ACCEPTANCE, axis=1, keepdims=True, method="weibull")

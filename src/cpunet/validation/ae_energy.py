@@ -16,7 +16,7 @@ from scipy.special import expit, log_ndtr, ndtr
 
 from cpunet.pulses.parameters import Values
 from cpunet.validation.a_over_e import DEP, Range
-from cpunet.validation.comparisons import Result
+from cpunet.validation.comparisons import Result, finite_values
 
 LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV = 900.0, 2700.0, 50.0
 BESIDE_KEV = 8.0  # margin of a line that is left out of the continuum
@@ -149,11 +149,10 @@ def against_energy(
     all_bands = single_site + [span for span in lines if span not in single_site]
     for bands in (single_site, all_bands):
         points = {
-            method: _points(values, energy_kev[method], bands, lines)
+            method: _site_fits(values, energy_kev[method], bands, lines)
             for method, values in amplitude.items()
         }
-        ranges = [{(p.low_kev, p.high_kev) for p in site_fits} for site_fits in points.values()]
-        common = set.intersection(*ranges)
+        common = set.intersection(*map(set, points.values()))
         if len(common) >= 3:
             break
     if len(common) < 3:  # a line through two points has no chi-square
@@ -162,7 +161,7 @@ def against_energy(
             "it takes three that both sides have: give events of more energies"
         )
     methods = {
-        method: _course([p for p in site_fits if (p.low_kev, p.high_kev) in common])
+        method: _course([point for span, point in site_fits.items() if span in common])
         for method, site_fits in points.items()
     }
     return AgainstEnergy(multi_site=bands is all_bands, methods=methods)
@@ -190,16 +189,44 @@ def site_fit(
     """
     from iminuit import Minuit
 
-    values = np.sort(amplitude[np.isfinite(amplitude)])
-    about = _seen(values) if about is None else about
+    values = np.sort(finite_values(amplitude))
     if about is None:
-        return None
+        if len(values) < MIN_EVENTS:
+            return None
+        # the middle of the shortest interval with a fifth of the values
+        n = max(20, len(values) // 5)
+        first = int((values[n - 1 :] - values[: len(values) - n + 1]).argmin())
+        centre = float(np.median(values[first : first + n]))
+        above = values[values > centre] - centre
+        about = centre, float(np.quantile(above, 0.68)) if len(above) >= 10 else 0.0
     centre, width = about
-    x = (values - centre) / width
+    x = (values - centre) / width if width else np.empty(0)
     x = x[(x > -BELOW) & (x < ABOVE)]
     if len(x) < MIN_EVENTS:
         return None
-    fit = Minuit(lambda parameters: _nll(parameters, x), np.array([0.0, 0.0, -0.5, 1.0]))
+
+    def negative_log_likelihood(parameters: Values) -> float:
+        mean, log_sigma, share, log_tail = parameters
+        log_sigma, log_tail = np.clip(log_sigma, -3, 3), np.clip(log_tail, -2, 4)
+        sigma, p, tail = np.exp(log_sigma), expit(share), np.exp(log_tail)
+        u = (x - mean) / sigma
+        shift = sigma / tail
+        gauss = np.exp(-0.5 * u**2) / (sigma * np.sqrt(2 * np.pi))
+        tailed = np.exp(0.5 * shift**2 + u * shift + log_ndtr(-u - shift)) / tail
+        inside = [
+            ndtr(v) + p * np.exp(0.5 * shift**2 + v * shift + log_ndtr(-v - shift))
+            for v in ((ABOVE - mean) / sigma, (-BELOW - mean) / sigma)
+        ]
+        norm = max(float(inside[0] - inside[1]), 1e-12)
+        density = ((1 - p) * gauss + p * tailed) / norm
+        # weak priors: a tail of a few widths, a tail fraction of about a third, and a width
+        # near the given one, since otherwise a chance cluster of a few events can be taken
+        # for the peak
+        prior = 0.5 * (((share + 0.5) / 2) ** 2 + ((log_tail - 1) / 1.5) ** 2)
+        prior += 0.5 * (log_sigma / 0.4) ** 2
+        return float(-np.log(np.maximum(density, 1e-300)).sum() + prior)
+
+    fit = Minuit(negative_log_likelihood, np.array([0.0, 0.0, -0.5, 1.0]))
     fit.errordef = Minuit.LIKELIHOOD
     fit.errors = (0.1, 0.1, 0.5, 0.5)
     fit.migrad().hesse()
@@ -210,15 +237,15 @@ def site_fit(
     return centre + width * mean, width * error, sigma, sigma * log_error, len(x)
 
 
-def _points(
+def _site_fits(
     amplitude: Values, energy_kev: Values, bands: Sequence[Range], lines: Sequence[Range]
-) -> list[SiteFit]:
+) -> dict[Range, SiteFit]:
+    """Fits by range in the order of energy; the double-escape peak, the first, guides them."""
     off_lines = np.ones(len(energy_kev), bool)
     for low, high in lines:
         off_lines &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
-    site_fits = []
-    about = None
-    for low, high in bands:  # the double-escape peak first, if there is one
+    site_fits, about = {}, None
+    for low, high in bands:
         inside = (energy_kev >= low) & (energy_kev < high)
         if (low, high) not in lines:
             inside &= off_lines
@@ -226,8 +253,8 @@ def _points(
         if fitted is not None:
             about = about or (fitted[0], fitted[2])
             centre = float(energy_kev[inside].mean())
-            site_fits.append(SiteFit(low, high, centre, *fitted))
-    return sorted(site_fits, key=lambda point: point.energy_kev)
+            site_fits[low, high] = SiteFit(low, high, centre, *fitted)
+    return dict(sorted(site_fits.items(), key=lambda item: item[1].energy_kev))
 
 
 def _course(points: list[SiteFit]) -> Course:
@@ -239,8 +266,7 @@ def _course(points: list[SiteFit]) -> Course:
     slope, scale = np.linalg.lstsq(design, mean / error, rcond=None)[0]
     covariance = np.linalg.inv(design.T @ design) / scale**2
     chi_square = float(np.sum(((mean - scale - slope * (energy - REFERENCE_KEV)) / error) ** 2))
-    a = float(slope / scale)
-    a_error = float(np.sqrt(covariance[0, 0]))
+    a, (a_error, scale_error) = float(slope / scale), np.sqrt(np.diag(covariance)).tolist()
     line = MeanLine(
         a=a,
         b=1 - a * REFERENCE_KEV,
@@ -261,44 +287,9 @@ def _course(points: list[SiteFit]) -> Course:
         squares = terms @ np.array([constant, b2])
     at_reference = float(100 * np.sqrt(constant + b2 * 1e6 / REFERENCE_KEV**2))
     law = WidthLaw(float(constant), float(1e3 * np.sqrt(b2)), 2.0, at_reference)
-    scale_error = float(scale * np.sqrt(covariance[1, 1]))
-    return Course(points, float(scale), scale_error, line, law)
+    return Course(points, float(scale), float(scale) * scale_error, line, law)
 
 
 def columns(points: Sequence[SiteFit]) -> Values:
     """Fitted values of the points, as rows of an array."""
     return np.array([[getattr(point, name) for point in points] for name in FITTED])
-
-
-def _seen(values: Values) -> tuple[float, float] | None:
-    """Position of the highest peak, and its width from its upper side."""
-    if len(values) < MIN_EVENTS:
-        return None
-    # the middle of the shortest interval with a fifth of the sorted values
-    n = max(20, len(values) // 5)
-    first = int((values[n - 1 :] - values[: len(values) - n + 1]).argmin())
-    centre = float(np.median(values[first : first + n]))
-    above = values[values > centre] - centre
-    width = float(np.quantile(above, 0.68)) if len(above) >= 10 else 0.0
-    return (centre, width) if width > 0 else None
-
-
-def _nll(parameters: Values, x: Values) -> float:
-    mean, log_sigma, share, log_tail = parameters
-    log_sigma, log_tail = np.clip(log_sigma, -3, 3), np.clip(log_tail, -2, 4)
-    sigma, p, tail = np.exp(log_sigma), expit(share), np.exp(log_tail)
-    u = (x - mean) / sigma
-    shift = sigma / tail
-    gauss = np.exp(-0.5 * u**2) / (sigma * np.sqrt(2 * np.pi))
-    tailed = np.exp(0.5 * shift**2 + u * shift + log_ndtr(-u - shift)) / tail
-    inside = [
-        ndtr(v) + p * np.exp(0.5 * shift**2 + v * shift + log_ndtr(-v - shift))
-        for v in ((ABOVE - mean) / sigma, (-BELOW - mean) / sigma)
-    ]
-    norm = max(float(inside[0] - inside[1]), 1e-12)
-    density = ((1 - p) * gauss + p * tailed) / norm
-    # weak priors: a tail of a few widths, a tail fraction of about a third, and a width near
-    # the given one, since otherwise a chance cluster of a few events can be taken for the peak
-    held = 0.5 * (((share + 0.5) / 2) ** 2 + ((log_tail - 1) / 1.5) ** 2)
-    held += 0.5 * (log_sigma / 0.4) ** 2
-    return float(-np.log(np.maximum(density, 1e-300)).sum() + held)

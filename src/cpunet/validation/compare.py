@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 from urllib.parse import quote
 
 import numpy as np
@@ -27,57 +27,31 @@ from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
 if TYPE_CHECKING:
     from pandas import DataFrame
 
+Cell = tuple[float, float | None, str, float]  # score, error, text, and distance from the best
 FEW = 8  # runs whose scores are printed side by side; of more, the page has them
 
 
-class Cell(NamedTuple):
-    """A score with its error, its text, and its distance from the best possible."""
-
-    value: float
-    error: float | None
-    text: str
-    off: float
-
-
 class Row(NamedTuple):
-    """One score of every run.
+    """One score of every run, in the order of the runs.
 
     Attributes
     ----------
     peak, score
         Name of the peak and of the score.
-    cells
-        Scores in the order of the runs; None of a run without.
+    values, texts
+        Numbers, and scores as displayed: the best are marked, if two or more runs have one.
+    far
+        Which runs are far from the median of all, beyond the scatter and the own error.
+    over
+        Median and standard deviation over the runs.
     """
 
     peak: str
     score: str
-    cells: list[Cell | None]
-
-    @property
-    def best(self) -> set[int]:
-        """Indices of the runs with the best score; empty if fewer than two have one."""
-        off = {i: cell.off for i, cell in enumerate(self.cells) if cell is not None}
-        return {i for i in off if len(off) > 1 and off[i] == min(off.values())}
-
-    @property
-    def texts(self) -> list[str]:
-        """Scores as displayed; the best are marked."""
-        shown = [NO_VALUE if cell is None else cell.text for cell in self.cells]
-        return [f"{text}{'*' * (i in self.best)}" for i, text in enumerate(shown)]
-
-    @property
-    def far(self) -> list[bool]:
-        """Which runs are far from the median of all, beyond the scatter and the own error."""
-        return outliers(
-            [c and c.value for c in self.cells], [c and c.error for c in self.cells]
-        )
-
-    @property
-    def over(self) -> str:
-        """Median and standard deviation over the runs."""
-        values = [cell.value for cell in self.cells if cell is not None]
-        return with_std(np.median(values), np.std(values, ddof=1)) if values[1:] else NO_VALUE
+    values: list[float | None]
+    texts: list[str]
+    far: list[bool]
+    over: str
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -91,11 +65,9 @@ class Comparison:
     ----------
     method
         Method that is scored.
-    metrics
-        Scores by run.  Runs have the names of their folders, made unique,
-        such as ``DETECTOR/PERIOD``.
-    folders
-        Folder of each report; None for those in memory.
+    reports
+        Report of each run, by the name of its folder, made unique, such as
+        ``DETECTOR/PERIOD``.
     missing
         Names of the reports that are not there.
     path
@@ -105,15 +77,13 @@ class Comparison:
     --------
     >>> iou = lambda value: {"iou": {"ren": value, "ceiling": 90.0}}
     >>> scores = lambda v: {"peaks": {"SEP": {"parameters": {"drift_time": iou(v)}}}}
-    >>> metrics = {name: Metrics(**scores(v)) for name, v in (("old", 80.0), ("new", 85.0))}
-    >>> made = Comparison("ren", metrics)
-    >>> made.rows[0].texts
+    >>> reports = {name: Report(Metrics(**scores(v))) for name, v in (("old", 80), ("new", 85))}
+    >>> Comparison("ren", reports).rows[0].texts
     ['80 (90.0)', '85 (90.0)*']
     """
 
     method: str
-    metrics: Mapping[str, Metrics]
-    folders: Mapping[str, Path | None] = field(default_factory=dict)
+    reports: Mapping[str, Report]
     missing: tuple[str, ...] = ()
     path: Path | None = None
 
@@ -121,12 +91,23 @@ class Comparison:
     def rows(self) -> list[Row]:
         """Scores that any run has, ordered by peak."""
         rows = []
-        for peak in _union(metrics.peaks for metrics in self.metrics.values()):
-            collected = [_scores(of_run, peak, self.method) for of_run in self.metrics.values()]
-            rows += [
-                Row(peak, score, [cells.get(score) for cells in collected])
-                for score in _union(collected)
-            ]
+        metrics = [report.metrics for report in self.reports.values()]
+        for peak in _union(of_run.peaks for of_run in metrics):
+            collected = [_scores(of_run, peak, self.method) for of_run in metrics]
+            for title in _union(collected):
+                cells = [scores.get(title) for scores in collected]
+                present = [cell for cell in cells if cell is not None]
+                least = min(off for *_, off in present) if len(present) > 1 else -1.0
+                values, numbers = [cell and cell[0] for cell in cells], [v for v, *_ in present]
+                over = NO_VALUE
+                if len(present) > 1:
+                    over = with_std(np.median(numbers), np.std(numbers, ddof=1))
+                texts = [
+                    f"{cell[2]}{'*' * (cell[3] == least)}" if cell else NO_VALUE
+                    for cell in cells
+                ]
+                far = outliers(values, [cell and cell[1] for cell in cells])
+                rows.append(Row(peak, title, values, texts, far, over))
         return rows
 
     @property
@@ -135,17 +116,27 @@ class Comparison:
         from pandas import DataFrame, MultiIndex
 
         index = MultiIndex.from_tuples([row[:2] for row in self.rows], names=["peak", "score"])
-        values = [[cell and cell.value for cell in row.cells] for row in self.rows]
-        return DataFrame(values, index, list(self.metrics), dtype=float)
+        values = [row.values for row in self.rows]
+        return DataFrame(values, index, list(self.reports), dtype=float)
 
     @property
     def note(self) -> str:
         """Signs that runs were not scored on the same pulses; empty if there are none."""
-        (first, first_pulses), *others = (
-            (n, _pulses(metrics)) for n, metrics in self.metrics.items()
-        )
+        pulses = {
+            name: {
+                "detectors": of.compared.get("detector"),
+                "peaks": of.peaks.keys(),
+                "numbers of measured pulses": {peak: s.n_data for peak, s in of.peaks.items()},
+                "rejections of measured pulses": of.rejections.get("data"),
+                "numbers of simulated pulses": {peak: s.n_sim for peak, s in of.peaks.items()},
+                "rejections of simulated pulses": of.rejections.get("sim"),
+            }
+            for name, of in ((n, report.metrics) for n, report in self.reports.items())
+        }
+        first, *others = pulses
         differing = {
-            name: [k for k in first_pulses if of[k] != first_pulses[k]] for name, of in others
+            name: [k for k, value in pulses[name].items() if value != pulses[first][k]]
+            for name in others
         }
         names = ", ".join(name for name, differences in differing.items() if differences)
         words = ", ".join(_union(differing.values()))
@@ -167,14 +158,14 @@ class Comparison:
             raise CpunetError(
                 f"{path}: is a folder", "give the name of a page, as compare.html"
             )
-        refuse_existing(path, *self.folders.values(), force=force)
+        refuse_existing(path, *(of.folder for of in self.reports.values()), force=force)
         links = {
-            name: quote(os.path.relpath(folder / PAGE, path.parent))
-            for name, folder in self.folders.items()
-            if folder is not None and (folder / PAGE).is_file()
+            name: quote(os.path.relpath(of.folder / PAGE, path.parent))
+            for name, of in self.reports.items()
+            if of.folder is not None and (of.folder / PAGE).is_file()
         }
         peaks = {row.peak: [r for r in self.rows if r.peak == row.peak] for row in self.rows}
-        title = f"{label(self.method)}: {len(self.metrics)} runs compared"
+        title = f"{label(self.method)}: {len(self.reports)} runs compared"
         values = {"title": title, "comparison": self, "links": links, "peaks": peaks}
         with written_aside(path) as aside:
             aside.write_text(
@@ -183,20 +174,20 @@ class Comparison:
 
     def __str__(self) -> str:
         lines = []
-        if self.path is None or len(self.metrics) <= FEW:
+        if self.path is None or len(self.reports) <= FEW:
             peaks = [row.peak for row in self.rows]
             rows = [
                 ["" if last == row.peak else row.peak, row.score, *row.texts]
                 for last, row in zip(["", *peaks], self.rows, strict=False)
             ]
             title = f"Scores of {self.method}, the best with *"
-            lines = [text_table(["peak", "score", *self.metrics], rows, words=2, title=title)]
+            lines = [text_table(["peak", "score", *self.reports], rows, words=2, title=title)]
             lines += [f"note: {self.note}"] if self.note else []
         lines += [f"no report: {name}" for name in self.missing]
         return "\n".join(lines if self.path is None else [*lines, str(self.path)])
 
     def __repr__(self) -> str:
-        return f"<Comparison of {', '.join(self.metrics)}: {self.method}>"
+        return f"<Comparison of {', '.join(self.reports)}: {self.method}>"
 
 
 def compare(
@@ -268,30 +259,28 @@ def compared(
     failed
         Reports to list as missing: what is in their folders is of an earlier validation.
     """
-    collected: list[tuple[Path, Metrics | None, Path | None]] = []
+    places: list[Path] = []
+    opened: list[Report | None] = []
     for report in reports:
-        if isinstance(report, Report):
-            # one in memory is named by its run
-            place = report.folder or Path(report.metrics.compared["run"])
-            collected.append((place, report.metrics, report.folder))
+        if isinstance(report, Report):  # of one in memory the run has a name
+            places.append(report.folder or Path(report.metrics.compared["run"]))
+            opened.append(report)
             continue
         path = Path(report)
         files = (path, path / METRICS, path / "report" / METRICS)  # the last one of a demo
         file = next((f for f in files if f.is_file() and path not in failed), None)
-        collected.append((path, read_metrics(file) if file else None, file and file.parent))
-    names = _names([place for place, _, _ in collected])
-    folders = {name: folder for name, (_, _, folder) in zip(names, collected, strict=True)}
-    each = zip(names, collected, strict=True)
-    runs = {name: metrics for name, (_, metrics, _) in each if metrics is not None}
+        places.append(path)
+        opened.append(Report(read_metrics(file), folder=file.parent) if file else None)
+    named = dict(zip(_names(places), opened, strict=True))
+    runs = {name: report for name, report in named.items() if report is not None}
     if not runs:
         raise CpunetError(
             f"none of the {len(reports)} reports is there",
             "give folders of cpunet validate or cpunet demo",
         )
-    missing = tuple(name for name in names if name not in runs)
-    made = Comparison(method, runs, folders, missing)
+    made = Comparison(method, runs, tuple(name for name in named if name not in runs))
     if not made.rows:
-        methods = _union(s.methods for metrics in runs.values() for s in metrics.peaks.values())
+        methods = _union(s.methods for of in runs.values() for s in of.metrics.peaks.values())
         raise CpunetError(
             f"{', '.join(runs)}: no score of the method {method}; "
             + (f"there are {', '.join(methods)}" if methods else "nothing is scored there")
@@ -300,47 +289,31 @@ def compared(
 
 
 def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
-    """Scores that a method has at a peak, by name."""
-    scores, cells = metrics.peaks.get(peak, PeakScores()), {}
+    """Scores that a method has at a peak, by name, and how far each is from the best."""
+    scores, cells = metrics.peaks.get(peak, PeakScores()), dict[str, Cell]()
     for name, compared in scores.parameters.items():
         if (iou := compared.iou.get(method)) is not None:
             error, ceiling = compared.iou_std.get(method), compared.iou.get("ceiling")
             text = with_std(iou, error) + ("" if ceiling is None else f" ({ceiling:.1f})")
             title = f"{name.replace('_', ' ')}: IoU [%] (data vs data)"
-            cells[title] = Cell(iou, error, text, 100 - iou)
+            cells[title] = iou, error, text, 100 - iou
     if isinstance(tested := scores.two_sample.get(method), TwoSample):
         text, off = with_std(tested.auc, tested.auc_std), abs(tested.auc - tested.null_mean)
-        cells["classifier: AUC"] = Cell(tested.auc, tested.auc_std, text, off)
+        cells["classifier: AUC"] = tested.auc, tested.auc_std, text, off
     if method in scores.paired and (edge := scores.paired[method].edge_rmse) is not None:
-        cells["edge RMSE [10⁻³]"] = Cell(1e3 * edge, None, f"{1e3 * edge:#.3g}", edge)
-    differences = {
-        f"{QUANTITIES[name]} minus data [{LABELLED[name].unit}]".removesuffix(" []"): (
-            scores.judged[name].shift.get(method),
-            scores.judged[name].shift_std.get(method),
-        )
-        for name in MAIN
-        if name in scores.judged
-    }
+        cells["edge RMSE [10⁻³]"] = 1e3 * edge, None, f"{1e3 * edge:#.3g}", edge
+    differences = {}
+    for name in (name for name in MAIN if name in scores.judged):
+        compared, unit = scores.judged[name], LABELLED[name].unit
+        title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
+        differences[title] = compared.shift.get(method), compared.shift_std.get(method)
     if (row := metrics.survival.get(peak)) is not None:
         title = "A/E survival minus data [points]"
         differences[title] = row.difference.get(method), row.difference_std.get(method)
     for title, (difference, std) in differences.items():
         if difference is not None:
-            cells[title] = Cell(difference, std, signed(difference, std), abs(difference))
+            cells[title] = difference, std, signed(difference, std), abs(difference)
     return cells
-
-
-def _pulses(metrics: Metrics) -> dict[str, Any]:
-    """What distinguishes the pulses of a validation from those of another."""
-    peaks, rejections = metrics.peaks, metrics.rejections
-    return {
-        "detectors": metrics.compared.get("detector"),
-        "peaks": peaks.keys(),
-        "numbers of measured pulses": {peak: of.n_data for peak, of in peaks.items()},
-        "rejections of measured pulses": rejections.get("data"),
-        "numbers of simulated pulses": {peak: of.n_sim for peak, of in peaks.items()},
-        "rejections of simulated pulses": rejections.get("sim"),
-    }
 
 
 def _union(names: Iterable[Iterable[str]]) -> list[str]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
@@ -14,41 +13,18 @@ from cpunet.errors import CpunetError
 from cpunet.processes import one_thread_for_matrices, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
-from cpunet.pulses.parameters import Values, tail_slope
+from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.shape_parameters import median_decay_ns
 from cpunet.recipes.schema import Recipe
 from cpunet.training.run import Run, resolve_device
 from cpunet.translation.translator import REN
-from cpunet.validation.a_over_e import (
-    DEP,
-    Range,
-    RangeSurvival,
-    SurvivalRow,
-    dep_scales,
-    peak_survival,
-    subtracted,
-    survival_table,
-)
+from cpunet.validation.a_over_e import DEP, Range, dep_scales, survivals
 from cpunet.validation.ae_energy import against_energy
-from cpunet.validation.comparisons import Missing
-from cpunet.validation.methods import (
-    Translations,
-    fit_baseline_methods,
-    translate_all,
-    true_responses,
-)
-from cpunet.validation.metrics import Metrics, PeakScores
-from cpunet.validation.peaks import (
-    ByMethod,
-    PeakSets,
-    Slices,
-    fit_ends,
-    moved_values,
-    score_peak,
-    sliced,
-)
+from cpunet.validation.methods import fit_baseline_methods, translate_all, true_responses
+from cpunet.validation.metrics import Metrics
+from cpunet.validation.peaks import PeakSets, fit_ends, score_peak
 
 MAX_PULSES = 50_000  # per side, for an error of the scores of about 0.3 percentage points
 
@@ -61,17 +37,14 @@ class Evaluation:
     ----------
     run
         The run.
-    sets, values, slices
-        Pulses, and parameters and mean pulses by method, each by peak.  The latter two exist
-        only for scored peaks.
+    sets
+        Pulses of each peak and, if it is scored, their parameters.
     metrics
         All numbers.
     """
 
     run: Run
     sets: list[PeakSets]
-    values: Mapping[str, ByMethod]
-    slices: Mapping[str, Mapping[str, Slices]]
     metrics: Metrics
 
 
@@ -109,16 +82,10 @@ def evaluate(
     require_same_sampling(sim_set, data_set)
     ren.require_sampling(f"{sim_set.path}:", sim_set.dt_ns)
     responses = None if truth is None else true_responses(truth, sim_set)
-    baseline_methods = fit_baseline_methods(
-        sim_set,
-        data_set,
-        parse_selection(trained_on, recipe.peaks),
-        recipe,
-        tails=ren.tails,
-        fitted=baselines,
-    )
-    translations = translate_all(ren, baseline_methods, sim_set, data_set, responses, seed)
-    sets = [PeakSets.of(n, parse_selection(n, recipe.peaks), translations) for n in names]
+    fit_on = parse_selection(trained_on, recipe.peaks)
+    fits = fit_baseline_methods(ren, sim_set, data_set, fit_on, fitted=baselines)
+    translations = translate_all(ren, fits, sim_set, data_set, responses, seed)
+    sets = [PeakSets.of(name, translations) for name in names]
     dep = next((peak.rows for peak in sets if peak.name == DEP), {})
     amplitudes, energy_kev = translations.amplitudes, translations.energy_kev
     scales = dep_scales({m: amplitudes[m][rows] for m, rows in dep.items()}, seed)
@@ -128,46 +95,35 @@ def evaluate(
         for method, windows in translations.windows.items()
     }
     ends = fit_ends(run, ren)
-    score = partial(score_peak, recipe=recipe, seed=seed, scales=scales, decays_ns=decays)
-
-    def scored(peak: PeakSets) -> tuple[dict[str, Values], ByMethod, PeakScores]:
-        moved = moved_values(peak, ends, seed)
-        return moved, *score(peak, moved)
-
-    values: dict[str, ByMethod] = {}
-    peaks: dict[str, PeakScores] = {}
-    slices: dict[str, dict[str, Slices]] = {}
-    moved_amplitudes: dict[str, Values] = {}
+    score = partial(score_peak, ends=ends, seed=seed, scales=scales, decays_ns=decays)
+    peaks = {}
     with stage("Scoring", len(sets)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
-        for peak, (moved, by_method, scores) in zip(sets, pool.map(scored, sets), strict=True):
+        for peak, scores in zip(sets, pool.map(score, sets), strict=True):
             peaks[peak.name] = scores
-            if moved:
-                moved_amplitudes[peak.name] = moved["current_amplitude"]
-            if by_method:
-                values[peak.name] = by_method
-                rise = {method: v["rise_01_90"] for method, v in by_method.items()}
-                slices[peak.name] = sliced(peak.windows, rise, run.dt_ns)
             bar.update(1)
-    if not values:
+    name = "current_amplitude"
+    ae = {p.name: {m: v[name] for m, v in p.values.items()} for p in sets if p.values}
+    if not ae:
         raise CpunetError(
             f"{data_set.path}: no peak has pulses on both sides",
             "check the calibration (`kev_per_adc`, `data_energy`)",
         )
-    survivals, ranges = _survivals(
-        {
-            name: {method: v["current_amplitude"] for method, v in of_peak.items()}
-            for name, of_peak in values.items()
-        },
-        moved_amplitudes,
-        translations,
-        lines | {name: (span, []) for name, span in recipe.scores.continuum_kev.items()},
+    continua: dict[str, tuple[Range, list[Range]]] = {
+        n: (span, []) for n, span in recipe.scores.continuum_kev.items()
+    }
+    survival, ranges = survivals(
+        ae,
+        {peak.name: peak.moved[name] for peak in sets if peak.moved},
+        amplitudes,
+        energy_kev,
+        lines | continua,
         seed,
     )
     tails = None if run.fit is None else run.fit.tails
     metrics = Metrics(
         compared=_compared(run, sim_set, data_set),
         peaks=peaks,
-        ae_survival=survivals,
+        ae_survival=survival,
         ae_details={"survival by energy range": ranges},
         ae_energy=against_energy(
             {method: amplitudes[method] for method in ("data", "ren")},
@@ -176,42 +132,15 @@ def evaluate(
         ),
         a_over_e_scale=scales,
         baseline_methods={
-            "fits": {name: of.describe() for name, of in baseline_methods.methods.items()},
-            "missing": baseline_methods.missing,
+            "fits": {name: of.describe() for name, of in fits.methods.items()},
+            "missing": fits.missing,
         },
         training={"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
         tails=None if tails is None else tails.model_dump(exclude_unset=True),
-        rejections={
-            "sim": sim_set.prepared.rejections,
-            "data": data_set.prepared.rejections,
-        },
+        rejections={"sim": sim_set.prepared.rejections, "data": data_set.prepared.rejections},
     )
-    return Evaluation(run, sets, values, slices, metrics)
-
-
-def _survivals(
-    ae: Mapping[str, Mapping[str, Values]],
-    moved: Mapping[str, Values],
-    translations: Translations,
-    bands: Mapping[str, tuple[Range, list[Range]]],
-    seed: int,
-) -> tuple[dict[str, SurvivalRow] | Missing, dict[str, dict[str, RangeSurvival]] | Missing]:
-    """A/E survival of peaks, and of bands of energy with their sidebands subtracted."""
-    table = survival_table(ae, moved, seed=seed)
-    if isinstance(table, Missing):
-        return table, Missing(missing=f"there is no A/E cut: {table.missing}")
-    cuts, errors = table[DEP].cut, table[DEP].cut_std
-    values, kev = translations.amplitudes, translations.energy_kev
-    ranges = {
-        name: {
-            m: peak_survival(values[m], kev[m], cut, span, sidebands, errors[m])
-            for m, cut in cuts.items()
-        }
-        for name, (span, sidebands) in bands.items()
-        if name != DEP
-    }
-    return subtracted(table, ranges), ranges
+    return Evaluation(run, sets, metrics)
 
 
 def _lines(recipe: Recipe) -> dict[str, tuple[Range, list[Range]]]:
@@ -244,21 +173,16 @@ def _compared(run: Run, sim: InputSet, data: InputSet) -> dict[str, str]:
         run.started[:10],
     )
     legend = re.match(r"l\d+-(p\d\d)-(r\d{3})-", data.path.name)
+    # places of files do not depend on where a study is stored
     facts = {
         "detector": sim.detector,
         "channel": data.read_as.get("table"),
         "period": legend and f"{legend[1]} {legend[2]}",
-    }
-    compared = {name: str(value) for name, value in facts.items() if value is not None}
-    compared |= {
-        # which do not depend on where a study is stored
-        **{
-            name: "/".join(side.path.absolute().parts[-2:])
-            for name, side in (("simulation", sim), ("data", data))
-        },
+        "simulation": "/".join(sim.path.absolute().parts[-2:]),
+        "data": "/".join(data.path.absolute().parts[-2:]),
         "run": Path(run.name).absolute().name,
         "trained": ", ".join(filter(None, training)),
+        "fit": run.fit and run.fit.verdict,
+        "scored with": f"cpunet {cpunet.__version__}",
     }
-    if run.fit is not None and run.fit.verdict:
-        compared["fit"] = run.fit.verdict
-    return compared | {"scored with": f"cpunet {cpunet.__version__}"}
+    return {name: str(value) for name, value in facts.items() if value}

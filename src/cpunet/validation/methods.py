@@ -12,17 +12,19 @@ the alignment is not a difference of shape.
 from __future__ import annotations
 
 import logging
+from collections import defaultdict
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_methods import BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise
+from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import Finished, finish
 from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.electronics.superpulses import BASELINE_METHODS
@@ -34,7 +36,6 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.recipes.schema import Recipe
 from cpunet.translation.translator import REN
 from cpunet.validation.metrics import PairedScores
 
@@ -100,8 +101,11 @@ def pair_squares(
     edge = slice(max(half - edge_samples, 0), half + edge_samples + 1)
     for method, translated in methods.items():
         difference = aligned_block(translated, half, half) - aligned
-        parts = _squares(difference), _squares(difference[:, edge])
-        squares[method] = np.concatenate(parts, axis=1)
+        columns = []
+        for part in (difference, difference[:, edge]):
+            values = np.nan_to_num(part)
+            columns += [np.einsum("ij,ij->i", values, values), np.isfinite(part).sum(axis=1)]
+        squares[method] = np.stack(columns, axis=1)
     return squares
 
 
@@ -131,13 +135,6 @@ def scores_of_squares(squares: Values) -> PairedScores:
     return PairedScores(rmse=rmse, edge_rmse=edge_rmse, unaligned=unaligned)
 
 
-def _squares(difference: Values) -> Values:
-    """Sum of squares of the values that are not NaN, and their number, row by row."""
-    comparable = np.isfinite(difference)
-    values = np.where(comparable, difference, 0)
-    return np.stack([np.einsum("ij,ij->i", values, values), comparable.sum(axis=1)], axis=1)
-
-
 @dataclass(eq=False)
 class FittedBaselineMethods:
     """The fitted baseline methods, and the noise that is added to them and to the truth.
@@ -159,26 +156,18 @@ class FittedBaselineMethods:
 
 
 def fit_baseline_methods(
-    sim: InputSet,
-    data: InputSet,
-    fit_on: EnergySelection,
-    recipe: Recipe,
-    *,
-    tails: DrawnTails | None = None,
-    fitted: bool,
+    ren: REN, sim: InputSet, data: InputSet, fit_on: EnergySelection, *, fitted: bool
 ) -> FittedBaselineMethods:
     """Fit every baseline method to unpaired pulses.
 
     Parameters
     ----------
+    ren
+        REN, whose recipe and pile-up tails the methods share.
     sim, data
         All prepared pulses of both sides.
     fit_on
         Energies on which the methods are fitted: those of the training.
-    recipe
-        Recipe of the run.
-    tails
-        Pile-up tails as learned by the run.
     fitted
         Whether to fit the methods; the noise is measured in any case, for the truth.
 
@@ -187,24 +176,23 @@ def fit_baseline_methods(
     FittedBaselineMethods
         Methods that cannot be fitted are listed as missing, with the reason.
     """
-    config, result = recipe.preparation, FittedBaselineMethods()
-    kinds = BASELINE_METHODS if fitted else {}
-    with_tails = tails is not None and tails.law.rate_khz > 0
-    measured_tails = tails_of(data)[0] if with_tails else None
+    result, tails = FittedBaselineMethods(), ren.tails
+    if tails is not None and tails.law.rate_khz <= 0:
+        tails = None
+    measured_tails = None if tails is None else tails_of(data)[0]
     try:
         noise = noise_of(data, measured_tails)
-        result.noise = TraceNoise(noise, tails) if with_tails else noise
+        result.noise = noise if tails is None else TraceNoise(noise, tails)
     except CpunetError as error:
         result.missing["noise"] = str(error)
-    fit_sim, fit_data = (
-        side.prepared.pulses.waveforms[fit_on.select(side.prepared.pulses.energy_kev)]
-        for side in (sim, data)
-    )
+    pulses = [side.prepared.pulses for side in (sim, data)]
+    fit_sim, fit_data = (of.waveforms[fit_on.select(of.energy_kev)] for of in pulses)
+    kinds = BASELINE_METHODS if fitted else {}
     with (
         stage("Fitting baseline methods", len(kinds)) as bar,
         ThreadPoolExecutor(usable_cores()) as pool,
     ):
-        how = (fit_sim, fit_data, sim.dt_ns, config.samples_before)
+        how = (fit_sim, fit_data, sim.dt_ns, ren.recipe.preparation.samples_before)
         fits = {name: pool.submit(kind, *how) for name, kind in kinds.items()}
         for name, fit in fits.items():
             try:
@@ -282,58 +270,47 @@ def translate_all(
         Seed of the noise, common to all methods.
     """
     pulses, recipe, noise = sim.prepared.pulses, ren.recipe, baselines.noise
-    given: dict[str, FloatArray] = {} if responses is None else {"truth": responses}
+    given = {} if responses is None else {"truth": responses}
     others = [*baselines.methods, *given]
-    shape = (len(pulses), recipe.preparation.length)
-    noisy = {
-        name: np.empty(shape, np.float32)
-        for name in (*baselines.methods, "ren", "truth")  # from the simplest to the truth
-        if name == "ren" or (name in others and noise is not None)
-    }
-    truth, comparable = None, np.ones(len(pulses), bool)
-    squares: dict[str, Values] = {}
-    if responses is not None:
-        truth = np.empty(shape, np.float32)
-        squares = {m: np.zeros((len(pulses), 4)) for m in ("raw", *baselines.methods, "ren")}
-    generator = np.random.default_rng(seed)
     # all methods get the same noise
-    rngs = {name: np.random.default_rng(seed) for name in others}
+    generator, *rngs = (np.random.default_rng(seed) for _ in ("ren", *others))
 
-    def finished(name: str, rows: slice) -> Finished:
+    def finished(name: str, rows: slice, rng: np.random.Generator) -> Finished:
         method, raw = baselines.methods.get(name), pulses.waveforms[rows]
-        return finish(
-            given[name][rows] if method is None else method.translate(raw),
-            recipe.preparation,
-            dt_ns=pulses.dt_ns,
-            noise=noise,
-            energy_kev=pulses.energy_kev[rows],
-            seed=rngs[name],
-        )
+        records = given[name][rows] if method is None else method.translate(raw)
+        kev, config = pulses.energy_kev[rows], recipe.preparation
+        return finish(records, config, dt_ns=ren.dt_ns, noise=noise, energy_kev=kev, seed=rng)
 
-    with (
-        stage("Translating", len(pulses)) as bar,
-        ThreadPoolExecutor(usable_cores()) as pool,
-    ):
+    noisy, squares = (defaultdict[str, list[Any]](list) for _ in range(2))
+    comparable: list[Flags] = []
+    truth: list[FloatArray] = []
+    with stage("Translating", len(pulses)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         for rows in blocks(len(pulses)):
             block = pulses[rows]
-            done = {name: pool.submit(finished, name, rows) for name in others}
+            done = [
+                pool.submit(finished, n, rows, rng) for n, rng in zip(others, rngs, strict=True)
+            ]
             clean = {"raw": block.waveforms}
-            for name, translated in done.items():
+            for name, translated in zip(others, done, strict=True):
                 clean[name] = translated.result().clean
                 if noise is not None:
-                    noisy[name][rows] = translated.result().windows
+                    noisy[name].append(translated.result().windows)
             clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
-            noisy["ren"][rows] = like_data(ren, block, generator)
-            for windows in clean.values():
-                comparable[rows] &= np.isfinite(windows).all(axis=1)
-            if truth is not None:
-                truth[rows] = clean.pop("truth")
-                squares_of_block = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
-                for name, of_block in squares_of_block.items():
-                    squares[name][rows] = of_block
+            noisy["ren"].append(like_data(ren, block, generator))
+            comparable.append(
+                np.all([np.isfinite(w).all(axis=1) for w in clean.values()], axis=0)
+            )
+            if responses is not None:
+                truth.append(clean.pop("truth"))
+                edge_samples = recipe.scores.edge_samples
+                for name, of_block in pair_squares(clean, truth[-1], edge_samples).items():
+                    squares[name].append(of_block)
             bar.update(len(block))
     measured = data.prepared.pulses
-    every = {"data": measured.waveforms, "raw": pulses.waveforms} | noisy
+    every = {"data": measured.waveforms, "raw": pulses.waveforms}
+    for name in (*baselines.methods, "ren", "truth"):  # from the simplest to the truth
+        if name in noisy:
+            every[name] = np.concatenate(noisy.pop(name))
     return Translations(
         ren,
         baselines,
@@ -341,9 +318,9 @@ def translate_all(
         {m: np.asarray(np.isfinite(windows).all(axis=1)) for m, windows in every.items()},
         {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every},
         {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()},
-        comparable,
-        squares,
-        truth,
+        np.concatenate(comparable),
+        {method: np.concatenate(of_method) for method, of_method in squares.items()},
+        np.concatenate(truth) if truth else None,
     )
 
 

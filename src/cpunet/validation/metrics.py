@@ -33,6 +33,7 @@ ALARM = 2.7e-3  # p of three standard deviations
 SAME = 3e-5  # 1 - p of samples that agree too well
 SMALLEST = 1e-12  # p that is stated
 NAMED = 3  # quantities that a headline names
+WRITTEN = ("p", "sigma", "numbers", "words")  # of a verdict
 
 # Quantities of the main table, those of LEGEND; the first needs the double-escape peak.
 MAIN = (A_OVER_E, "rise_time", "tail_slope", "lq")
@@ -214,10 +215,7 @@ class Metrics(Result):
         table = {
             peak: {
                 method: {
-                    quantity: {
-                        **{"p": v.p, "sigma": v.sigma},
-                        **{"numbers": v.numbers, "words": v.words},
-                    }
+                    quantity: {key: getattr(v, key) for key in WRITTEN}
                     for quantity, v in self.judge(peak, method).items()
                 }
                 for method in scores.methods
@@ -240,11 +238,15 @@ class Metrics(Result):
         """
         scores, verdicts = self.peaks[peak], {}
         for name, compared in scores.judged.items():
-            off = compared.shift.get(method), compared.shift_std.get(method)
+            difference, error = compared.shift.get(method), compared.shift_std.get(method)
             mean = "–" if compared.mean is None else f"{compared.mean:#.4g}"
-            words = _shifted(name, compared, *off)
-            p = compared.p.get(method)
-            verdicts[name] = Verdict(p, words, "too few pulses", off, mean)
+            words, unit, scale = "", LABELLED[name].unit, 1.0
+            if name == "current_amplitude" and compared.mean:
+                unit, scale = "%", 100 / compared.mean
+            if difference is not None and error is not None:
+                words = f"{signed(scale * difference, scale * error)} {unit}".rstrip()
+            off = difference, error
+            verdicts[name] = Verdict(compared.p.get(method), words, "too few pulses", off, mean)
         tested = scores.two_sample.get(method)
         if isinstance(tested, Missing):
             verdicts[_AUC] = Verdict(None, reason=tested.missing)
@@ -386,16 +388,6 @@ def signed(value: float | None, error: float | None) -> str:
 def called(quantity: str) -> str:
     """Name of a quantity in a sentence."""
     return _CALLED.get(quantity, quantity.replace("_", " "))
-
-
-def _shifted(name: str, compared: Compared, shift: float | None, error: float | None) -> str:
-    """Mean of a parameter minus that of the data, with its error and unit."""
-    if shift is None or error is None:
-        return ""
-    unit = LABELLED[name].unit
-    if name == "current_amplitude" and compared.mean:
-        shift, error, unit = 100 * shift / compared.mean, 100 * error / compared.mean, "%"
-    return f"{signed(shift, error)} {unit}".rstrip()
 
 
 def _p(value: float) -> str:

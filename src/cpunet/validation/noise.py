@@ -63,10 +63,7 @@ class Spectrum(Result):
 
 
 def baseline_spectra(
-    windows: Mapping[str, FloatArray],
-    begins: Mapping[str, Values],
-    samples: int,
-    dt_ns: float,
+    windows: Mapping[str, FloatArray], begins: Mapping[str, Values], samples: int, dt_ns: float
 ) -> dict[str, Spectrum]:
     """Compare the baseline noise of each method with that of the data.
 
@@ -101,14 +98,20 @@ def baseline_spectra(
     steps = 2 ** np.arange(0, np.log2(samples // 2 + 1), 1 / BANDS_PER_OCTAVE)
     edges = np.unique(np.append(np.ceil(steps), samples // 2 + 1)).astype(float)
     frequencies = np.sqrt(edges[1:] * np.maximum(edges[:-1], 0.5)) / (samples * dt_ns * 1e-3)
-    spectra = {}
+    taper = np.hanning(samples + 1)[:-1]
+    spectra: dict[str, Spectrum] = {}
     for method, pulses in windows.items():
-        power = _band_powers(pulses[free[method] >= samples, :samples], edges)
-        if len(power) < MIN_BASELINES:
-            missing = f"{len(power)} baselines; {MIN_BASELINES} are needed"
-            spectra[method] = Spectrum(missing=missing)
+        baselines = pulses[free[method] >= samples, :samples]
+        baselines = baselines[np.isfinite(baselines).all(axis=1)].astype(float)
+        if (n := len(baselines)) < MIN_BASELINES:
+            spectra[method] = Spectrum(missing=f"{n} baselines; {MIN_BASELINES} are needed")
             continue
-        n, total = len(power), power.sum(axis=1)
+        centred = (baselines - baselines.mean(axis=1, keepdims=True)) * taper
+        power = np.abs(np.fft.rfft(centred, axis=1)) ** 2 * 2 / (samples * (taper @ taper))
+        if samples % 2 == 0:
+            power[:, -1] /= 2  # the highest frequency occurs only once
+        power = np.add.reduceat(power, edges[:-1].astype(int), axis=1)
+        total = power.sum(axis=1)
         rms = float(np.sqrt(total.mean()))
         spectra[method] = Spectrum(
             samples=samples,
@@ -121,39 +124,20 @@ def baseline_spectra(
         )
     data = spectra["data"]
     for method, own in spectra.items():
-        if method != "data" and not (own.missing or data.missing):
-            difference = np.subtract(own.power, data.power)
-            errors = np.hypot(own.power_std, data.power_std)
-            bands = np.abs(difference[errors > 0] / errors[errors > 0])
-            error = np.hypot(own.rms_std or 0.0, data.rms_std or 0.0)
-            own.rms_ratio = (own.rms or 0.0) / data.rms if data.rms else None
-            own.sigma = ((own.rms or 0.0) - (data.rms or 0.0)) / error if error else None
-            own.worst_band_sigma = bands.max() if bands.size else None
-            own.spectrum_sigma = _of_so_many(float(bands.max(initial=0)), bands.size)
+        if method == "data" or own.missing or data.missing:
+            continue
+        difference = np.subtract(own.power, data.power)
+        errors = np.hypot(own.power_std, data.power_std)
+        bands = np.abs(difference[errors > 0] / errors[errors > 0])
+        error = np.hypot(own.rms_std or 0.0, data.rms_std or 0.0)
+        own.rms_ratio = (own.rms or 0.0) / data.rms if data.rms else None
+        own.sigma = ((own.rms or 0.0) - (data.rms or 0.0)) / error if error else None
+        own.worst_band_sigma = bands.max() if bands.size else None
+        # a one-sided deviation as unlikely as the largest of so many two-sided ones (Šidák),
+        # which equal spectra do not have
+        own.spectrum_sigma, worst = None, float(bands.max(initial=0))
+        if (of_one := erfc(worst / np.sqrt(2))) < 1:
+            chance = -np.expm1(bands.size * np.log1p(-of_one))
+            # beyond 37 standard deviations the probability underflows, and it does not matter
+            own.spectrum_sigma = float(-ndtri(chance)) if chance > 0 else worst
     return spectra
-
-
-def _band_powers(baselines: FloatArray, edges: Values) -> Values:
-    """Mean square of each baseline in each band, shape (baselines, bands)."""
-    whole = baselines[np.isfinite(baselines).all(axis=1)].astype(float)
-    samples = baselines.shape[1]
-    window = np.hanning(samples + 1)[:-1]
-    centred = (whole - whole.mean(axis=1, keepdims=True)) * window
-    power = np.abs(np.fft.rfft(centred, axis=1)) ** 2 * 2 / (samples * (window @ window))
-    if samples % 2 == 0:
-        power[:, -1] /= 2  # the highest frequency occurs only once
-    starts = edges[:-1].astype(int)
-    return np.asarray(np.add.reduceat(power, starts, axis=1))
-
-
-def _of_so_many(worst: float, n: int) -> float | None:
-    """One-sided deviation as unlikely as the largest of `n` two-sided ones (Šidák).
-
-    None if the spectra are equal, which no one-sided deviation expresses.
-    """
-    of_one = erfc(worst / np.sqrt(2))
-    if of_one == 1:
-        return None
-    chance = -np.expm1(n * np.log1p(-of_one))
-    # beyond 37 standard deviations the probability underflows, and it does not matter
-    return float(-ndtri(chance)) if chance > 0 else worst

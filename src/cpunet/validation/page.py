@@ -13,13 +13,12 @@ from pathlib import Path
 from markupsafe import Markup
 from matplotlib.figure import Figure
 
-from cpunet.html_pages import asset, figure_html, joined, rendered
+from cpunet.html_pages import asset, figure_html, rendered
 from cpunet.plotting import COLOURS, label
 from cpunet.progress import stage
-from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.settings import flat
-from cpunet.tables import NO_VALUE, number, with_std
+from cpunet.tables import number, with_std
 from cpunet.validation.metrics import Metrics, called
 from cpunet.validation.report import PAGE
 
@@ -34,22 +33,21 @@ SHOWS = {
     "further parameters": "distributions of further parameters, data and each method",
     "A over E survival": "survival of other peaks against that of the double-escape peak",
     "A over E and energy": "position and width of the single-site peak of A/E against energy",
+    "losses": "losses of the training by iteration",
+    "cycle of simulation": "simulated pulses, their translations, and those back",
+    "cycle of data": "measured pulses, their translations, and those back",
+    "": "distribution in the data and by each method, and differences in standard errors",
 }
-DISTRIBUTION = "distribution in the data and by each method, and differences in standard errors"
-# section of a figure by the end of its name; all others are under Details
-PLACES = {
-    "overlap with data": "first",
-    "a over e": "distributions",
-    "rise time": "distributions",
-    "lq": "distributions",
-    "A over E survival": "ae",
-    "A over E and energy": "ae_energy",
-    "mean pulse": "first",
-    "superpulses": "slices",
-    "noise": "noise",
-    "single pulse": "pulses",
-    "further parameters": "further",
-    **{parameter.replace("_", " "): "distributions" for parameter in PARAMETERS},
+SECTIONS = {  # of figures, by the ends of their names
+    "first": ("overlap with data", "mean pulse"),
+    "slices": ("superpulses",),
+    "noise": ("noise",),
+    "pulses": ("single pulse",),
+    "further": ("further parameters",),
+    "ae": ("A over E survival",),
+    "ae_energy": ("A over E and energy",),
+    "others": ("losses", "cycle of simulation", "cycle of data"),
+    "distributions": ("",),
 }
 
 
@@ -72,22 +70,32 @@ def write_page(
     notes
         Paragraphs of plain text for the top of the page.
     """
-    drawn = {}
+    placed: dict[str, dict[str, Markup]] = {place: {} for place in SECTIONS}
     with stage("Drawing", len(figures)) as bar:
         for name, draw in figures.items():
             stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
-            shows = next((t for end, t in SHOWS.items() if name.endswith(end)), DISTRIBUTION)
-            file = folder / f"{stem}.svg"
-            drawn[name] = figure_html(name.replace("_", " "), draw(), file, shows)
+            caption = name.replace("_", " ")
+            place = next(p for p, ends in SECTIONS.items() if caption.endswith(ends))
+            shows = next(text for end, text in SHOWS.items() if caption.endswith(end))
+            placed[place][name] = figure_html(caption, draw(), folder / f"{stem}.svg", shows)
             bar.update(1)
     # of each method that is drawn, for the page's legend
-    methods = dict.fromkeys(re.findall('data-method="([^"]*)"', joined(drawn.values())))
+    drawn = "".join(html for of_place in placed.values() for html in of_place.values())
+    methods = dict.fromkeys(re.findall('data-method="([^"]*)"', drawn))
+    # of mean pulses and noise a few, preferably of peaks that took no part in the training
+    peak = str(metrics.training.get("peak"))
+    trained = tuple(f"{name} " for name in (peak, *peak.split(",")))
+    for place in ("first", "noise"):
+        shown = placed[place]
+        few = [n for n in shown if not n.startswith(trained)][:FIRST] or [*shown][:FIRST]
+        placed["others"] |= {name: html for name, html in shown.items() if name not in few}
+        placed[place] = {name: shown[name] for name in few}
     good, verdict = metrics.headline() if metrics.scored else (False, "")
     html = rendered(
         "report.html",
         title="CPU-Net validation",
         metrics=metrics,
-        placed=_placed(drawn, metrics.training.get("peak")),
+        placed={place: [*of_place.values()] for place, of_place in placed.items()},
         notes=notes,
         good=good,
         headline=verdict,
@@ -95,38 +103,7 @@ def write_page(
         rejections=[*flat(metrics.rejections, ": ")],
         training=[*flat(metrics.training, ": ")],
         script=Markup(asset("report.js")),
-        **{f.__name__: f for f in (called, label, number, percent, thousandths, with_std)},
+        **{f.__name__: f for f in (called, label, number, with_std)},
         unit=lambda name: LABELLED[name].unit,
     )
     (folder / PAGE).write_text(html, encoding="utf-8")
-
-
-def _placed(drawn: Mapping[str, Markup], trained_on: str | None) -> dict[str, list[Markup]]:
-    """Figures by their place on the page, see `PLACES`.
-
-    Mean pulses and noise are shown for a few peaks, preferably not those of the training.
-    """
-    trained = tuple(f"{peak} " for peak in [trained_on, *str(trained_on).split(",")])
-    names: dict[str, list[str]] = {place: [] for place in [*PLACES.values(), "others"]}
-    for name in drawn:
-        end = next((end for end in PLACES if name.replace("_", " ").endswith(end)), None)
-        names[PLACES[end] if end else "others"].append(name)
-    for place in ("first", "noise"):
-        held_out = [name for name in names[place] if not name.startswith(trained)]
-        few = (held_out or names[place])[:FIRST]
-        names["others"] += [name for name in names[place] if name not in few]
-        names[place] = few
-    return {place: [drawn[name] for name in chosen] for place, chosen in names.items()}
-
-
-def thousandths(value: float | None) -> str:
-    """Three digits of a thousand times a value."""
-    return NO_VALUE if value is None else f"{1e3 * value:#.3g}".rstrip(".")
-
-
-def percent(value: float | None, error: float | None) -> str:
-    """A value and its error, if any, to a tenth."""
-    if value is None:
-        return NO_VALUE
-    value = round(value, 1) + 0.0  # no negative zero
-    return f"{value:.1f}" if error is None else f"{value:.1f} ± {error:.1f}"

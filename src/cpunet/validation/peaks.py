@@ -28,33 +28,36 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from types import MappingProxyType
-from typing import Any, Self
+from functools import partial
+from typing import Self
 
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
-from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.processes import usable_cores
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum
-from cpunet.pulses.peaks import EnergySelection
+from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
 from cpunet.pulses.two_sample import TwoSample, classifier_auc
-from cpunet.recipes.schema import Recipe
 from cpunet.training.closed_forms import error_ends
 from cpunet.training.run import Run
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import REN
 from cpunet.validation.comparisons import Missing, compare
 from cpunet.validation.methods import Translations, scores_of_squares
-from cpunet.validation.metrics import PairedScores, PeakScores
+from cpunet.validation.metrics import PeakScores
 from cpunet.validation.noise import baseline_spectra
 
 BEFORE_NS, AFTER_NS = 1600.0, 2400.0  # of a mean pulse before and after half maximum
 SLICES = 4
+MIN_PULSES = 10  # minimum number of pulses of a distribution
+MOVED = 300  # pulses of a peak, for which the errors of a fit are calculated
+
+Rows = npt.NDArray[np.int64]
+ByMethod = dict[str, dict[str, Values]]
+Ends = Sequence[tuple[REN, REN]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,23 +91,6 @@ class MeanPulse:
         return cls(mean, error, int(np.isfinite(aligned).any(axis=1).sum()))
 
 
-@dataclass(frozen=True, eq=False)
-class Slices:
-    """The mean pulses of a dataset by rise time.
-
-    Attributes
-    ----------
-    whole
-        Mean of all pulses.
-    pulses, edges
-        Mean pulse of each slice, and the edges of the slices in ns.
-    """
-
-    whole: MeanPulse
-    pulses: tuple[MeanPulse, ...]
-    edges: Values
-
-
 def around_half(windows: FloatArray, dt_ns: float) -> FloatArray:
     """Pulses from `BEFORE_NS` before their half maximum to `AFTER_NS` after it."""
     before, after = round(BEFORE_NS / dt_ns), round(AFTER_NS / dt_ns)
@@ -116,7 +102,7 @@ def sliced(
     rise_time: Mapping[str, Values],
     dt_ns: float,
     slices: int = SLICES,
-) -> dict[str, Slices]:
+) -> tuple[Values, dict[str, list[MeanPulse]]]:
     """Mean pulses of each method, in the same slices of the rise time for all.
 
     Parameters
@@ -130,6 +116,13 @@ def sliced(
         Sampling period in ns.
     slices
         Number of slices.
+
+    Returns
+    -------
+    edges
+        Edges of the slices in ns.
+    means
+        By method the mean of all pulses, and that of each slice.
     """
     measured = rise_time["data"][np.isfinite(rise_time["data"])]
     edges = np.quantile(measured, np.linspace(0, 1, slices + 1))
@@ -138,18 +131,12 @@ def sliced(
         aligned = around_half(windows(method), dt_ns)
         place = np.searchsorted(edges[1:-1], times, side="right")
         place[~((times >= edges[0]) & (times <= edges[-1]))] = -1  # also those that are NaN
-        pulses = tuple(MeanPulse.of(aligned[place == i]) for i in range(slices))
-        means[method] = Slices(MeanPulse.of(aligned), pulses, edges)
-    return means
+        each = [MeanPulse.of(aligned[place == i]) for i in range(slices)]
+        means[method] = [MeanPulse.of(aligned), *each]
+    return edges, means
 
 
-MIN_PULSES = 10  # minimum number of pulses of a distribution
-
-Rows = npt.NDArray[np.int64]
-ByMethod = dict[str, dict[str, Values]]
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class PeakSets:
     """The pulses of one peak, as rows of the whole datasets.
 
@@ -162,15 +149,22 @@ class PeakSets:
     rows
         Rows of the pulses with noise, by method: the data, then from the simplest method to the
         truth; of translations those that can be prepared.
+    values
+        Pulse-shape parameters by method and name; empty if the peak is not scored.
+    moved
+        What the errors of the fit do to translated pulses, see `moved_values`.
     """
 
     name: str
     translations: Translations
     rows: dict[str, Rows]
+    values: ByMethod = field(default_factory=dict)
+    moved: dict[str, Values] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, name: str, chosen: EnergySelection, translations: Translations) -> Self:
+    def of(cls, name: str, translations: Translations) -> Self:
         """Select the pulses of a peak, of both sides and of the translations."""
+        chosen = parse_selection(name, translations.ren.recipe.peaks)
         rows = {
             method: np.flatnonzero(chosen.select(translations.energy_kev[method]) & whole)
             for method, whole in translations.whole.items()
@@ -188,52 +182,32 @@ class PeakSets:
         rows = self.rows["raw"]
         return rows[self.translations.comparable[rows]]
 
-    def paired_scores(self) -> dict[str, PairedScores]:
-        """Paired scores by method; none if the truth is unknown."""
-        rows, squares = self.known_to_all(), self.translations.squares
-        return {method: scores_of_squares(of[rows]) for method, of in squares.items()}
-
 
 def score_peak(
     peak: PeakSets,
-    moved: Mapping[str, Values],
     *,
-    recipe: Recipe,
+    ends: Ends,
     seed: int,
-    scales: Mapping[str, tuple[float, float]] = MappingProxyType({}),
-    decays_ns: Mapping[str, float] = MappingProxyType({}),
-) -> tuple[ByMethod, PeakScores]:
+    scales: Mapping[str, tuple[float, float]],
+    decays_ns: Mapping[str, float],
+) -> PeakScores:
     """Compare the pulses of a peak, method by method.
 
     Parameters
     ----------
     peak
-        Pulses of the peak.
-    moved
-        What the errors of the fit do to translated pulses, see
-        `cpunet.validation.peaks.moved_values`.
-    recipe
-        Recipe of the run.
+        Pulses of the peak, whose values are set.
+    ends
+        See `fit_ends`.
     seed
-        Seed of bootstraps and folds.
+        Seed of bootstraps and folds, and of the noise at all ends.
     scales
         A/E of the single-site peak in the double-escape peak and its error, by method.
     decays_ns
         Decay of all pulses of a method, for which LEGEND's parameters are corrected.
-
-    Returns
-    -------
-    values
-        Pulse-shape parameters by method and name.  Empty if the peak is not scored.
-    scores
-        Scores of the peak.
     """
-    raw, data = peak.rows["raw"], peak.rows["data"]
-    lost = {
-        method: int((~whole[raw]).sum())
-        for method, whole in peak.translations.whole.items()
-        if method != "data"
-    }
+    of_all, raw, data = peak.translations, peak.rows["raw"], peak.rows["data"]
+    lost = {m: int((~whole[raw]).sum()) for m, whole in of_all.whole.items() if m != "data"}
     result = PeakScores(
         n_sim=len(raw), n_data=len(data), not_prepared={m: n for m, n in lost.items() if n}
     )
@@ -242,113 +216,83 @@ def score_peak(
     if few:
         result.parameters = {}
         result.missing = f"{' and '.join(few)} pulses (at least {MIN_PULSES} are needed)"
-        return {}, result
-    dt_ns, samples = peak.translations.ren.dt_ns, recipe.preparation.baseline_samples
-    values = {
+        return result
+    dt_ns, recipe = of_all.ren.dt_ns, of_all.ren.recipe
+    values = peak.values = {
         method: all_parameters(
             Pulses.of(peak.windows(method), dt_ns=dt_ns),
             recipe.preparation,
             recipe.scores,
-            amplitudes=peak.translations.amplitudes[method][rows],
+            amplitudes=of_all.amplitudes[method][rows],
             decay_ns=decays_ns.get(method),
         )
         for method, rows in peak.rows.items()
     }
-    ends = {"ren": dict(moved)} | {m: {} for m in values if m not in ("data", "ren")}
+    methods = [method for method in values if method != "data"]
+    peak.moved = moved_values(peak, ends, seed)
+    moved = {method: dict(peak.moved) if method == "ren" else {} for method in methods}
     for method, of_method in values.items() if scales else ():
         a_over_e = of_method[A_OVER_E] = of_method["current_amplitude"] / scales[method][0]
         if method != "data":
             # both ends of the axis of its error, that of both positions of the peak
             own, other = (scales[m][1] / scales[m][0] for m in ("data", method))
             error = np.hypot(own, other)
-            moved_by = np.stack([a_over_e * (1 + error), a_over_e * (1 - error)])
-            ends[method][A_OVER_E] = moved_by[np.newaxis]
-    others = {m: of_method for m, of_method in values.items() if m != "data"}
-    compared = compare(values["data"], others, recipe.scores, seed, ends)
+            both = np.stack([a_over_e * (1 + error), a_over_e * (1 - error)])
+            moved[method][A_OVER_E] = both[np.newaxis]
+    others = {method: values[method] for method in methods}
+    compared = compare(values["data"], others, recipe.scores, seed, moved)
     result.parameters = {name: compared.pop(name) for name in PARAMETERS}
     result.further = compared
-    result.two_sample = classifier_tests(peak, values, seed)
+    with ThreadPoolExecutor(usable_cores()) as pool:
+        tests = pool.map(partial(classifier_test, peak, seed), methods)
+        result.two_sample = dict(zip(methods, tests, strict=True))
+    samples, before = recipe.preparation.baseline_samples, recipe.preparation.samples_before
     result.noise = baseline_spectra(
-        {method: peak.windows(method)[:, :samples].copy() for method in values},
-        {m: recipe.preparation.samples_before + of["t01"] / dt_ns for m, of in values.items()},
+        {m: of_all.windows[m][rows, :samples] for m, rows in peak.rows.items()},
+        {m: before + of_method["t01"] / dt_ns for m, of_method in values.items()},
         samples,
         dt_ns,
     )
-    if paired := peak.paired_scores():
-        result.paired = paired
-    return values, result
+    if of_all.squares:
+        rows = peak.known_to_all()
+        result.paired = {m: scores_of_squares(of[rows]) for m, of in of_all.squares.items()}
+    return result
 
 
-def classifier_tests(
-    peak: PeakSets, values: ByMethod, seed: int
-) -> dict[str, TwoSample | Missing]:
-    """Classifier test between each method and the data, for one peak.
+def classifier_test(peak: PeakSets, seed: int, method: str) -> TwoSample | Missing:
+    """Classifier test between a method and the data by their pulses and chief parameters.
 
     Parameters
     ----------
     peak
-        Pulses of the peak.
-    values
-        Pulse-shape parameters of those with noise, by method.
+        Pulses of the peak and their values.
     seed
         Seed of the folds.
+    method
+        Name of the method.
     """
-    data = peak.windows("data")
-    chief = {
-        m: {name: of_method[name] for name in PARAMETERS} for m, of_method in values.items()
-    }
-
-    def tested(method: str) -> TwoSample | Missing:
-        features = chief["data"], chief[method]
-        try:
-            return classifier_auc(data, peak.windows(method), seed=seed, features=features)
-        except CpunetError as error:
-            return Missing(missing=str(error))
-
-    methods = list(values)[1:]
-    with ThreadPoolExecutor(usable_cores()) as pool:
-        return dict(zip(methods, pool.map(tested, methods), strict=True))
-
-
-PULSES = 300  # of a peak, for which an effect is calculated
-
-Ends = Sequence[tuple[REN, REN]]
-
-
-@dataclass(frozen=True, eq=False)
-class _DrawnOnce(BaselineNoise):
-    """Noise that is drawn once for the same energies: all ends of an error have one seed."""
-
-    drawn: dict[bytes, tuple[FloatArray, Mapping[str, Any]]] = field(default_factory=dict)
-
-    def draw(self, energy_kev: Values, length: int, rng: np.random.Generator) -> FloatArray:
-        key = energy_kev.tobytes()
-        if key not in self.drawn:
-            noise = super().draw(energy_kev, length, rng)
-            noise.flags.writeable = False
-            self.drawn[key] = noise, rng.bit_generator.state
-        noise, rng.bit_generator.state = self.drawn[key]
-        return noise
+    both = ("data", method)
+    data, own = ({n: peak.values[m][n] for n in PARAMETERS} for m in both)
+    try:
+        return classifier_auc(*map(peak.windows, both), seed=seed, features=(data, own))
+    except CpunetError as error:
+        return Missing(missing=str(error))
 
 
 def fit_ends(run: Run, ren: REN) -> Ends:
     """A translator at both ends of each axis of the errors; none of a network."""
-    backend = copy.copy(ren.backend)
-    if run.fit is None or not isinstance(backend, ResponseBackend):
+    if run.fit is None or not isinstance(ren.backend, ResponseBackend):
         return []
-    if backend.noise is not None:
-        backend.noise = _DrawnOnce(**vars(backend.noise))
-
-    def at(response: ElectronicsResponse) -> REN:
-        moved = copy.copy(ren)
-        moved.backend = of_end = copy.copy(backend)
-        chain = copy.copy(backend.network)
-        chain.response = response
-        of_end.network = chain
-        return moved
-
-    response = backend.network.response
-    return [(at(a), at(b)) for a, b in error_ends(response, run.fit.covariance)]
+    ends = []
+    for pair in error_ends(ren.backend.network.response, run.fit.covariance):
+        both = []
+        for response in pair:
+            moved, backend = copy.copy(ren), copy.copy(ren.backend)
+            moved.backend, backend.network = backend, copy.copy(ren.backend.network)
+            backend.network.response = response
+            both.append(moved)
+        ends.append((both[0], both[1]))
+    return ends
 
 
 def moved_values(peak: PeakSets, ends: Ends, seed: int) -> dict[str, Values]:
@@ -369,7 +313,7 @@ def moved_values(peak: PeakSets, ends: Ends, seed: int) -> dict[str, Values]:
         By name, shape ``(axes, 2, pulses)``; empty without axes or pulses.
     """
     rows = peak.rows["ren"]
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), PULSES)).astype(int)]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOVED)).astype(int)]
     if not ends or not len(rows):
         return {}
     windows = peak.translations.windows["raw"][rows]

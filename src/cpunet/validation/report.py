@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import gc
 import json
 from collections import UserDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -31,9 +30,7 @@ if TYPE_CHECKING:
 
 METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
 REPORT = FolderKind(
-    name="report",
-    command="cpunet validate",
-    own=r"metrics\.json|report\.html|parameters\.npz",
+    name="report", command="cpunet validate", own=r"metrics\.json|report\.html|parameters\.npz"
 )
 # methods of the printed table, in the order of the page; those without noise are in the metrics
 _METHODS = ("raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth", "ceiling")
@@ -110,17 +107,17 @@ class Report:
         from pandas import DataFrame
 
         index = ["peak", "parameter", "method"]
-        rows = [
-            [
-                *(peak, parameter, method, iou, of.iou_std.get(method)),
-                *(of.iou.get("ceiling"), of.wasserstein.get(method)),
-            ]
-            for peak, scores in self.metrics.peaks.items()
-            for parameter, of in scores.parameters.items()
-            for method, iou in of.iou.items()
-            if method != "ceiling"
-        ]
         columns = [*index, "iou", "iou_std", "ceiling", "wasserstein"]
+        rows = []
+        for peak, scores in self.metrics.peaks.items():
+            for parameter, of in scores.parameters.items():
+                for method in (method for method in of.iou if method != "ceiling"):
+                    score, error, w1 = (
+                        by.get(method) for by in (of.iou, of.iou_std, of.wasserstein)
+                    )
+                    rows.append(
+                        [peak, parameter, method, score, error, of.iou.get("ceiling"), w1]
+                    )
         return DataFrame(rows, columns=columns).set_index(index)
 
     def __getitem__(self, peak: str) -> DataFrame:
@@ -245,22 +242,14 @@ class Report:
             for name in of_method
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
-        before = gc.get_threshold()
-        # garbage is collected rarely: each time, all that is loaded is looked through as well
-        gc.set_threshold(100_000, 20, 100)
-        try:
-            write_page(folder, self.metrics, self.drawn, self.notes)
-        finally:
-            gc.set_threshold(*before)
+        write_page(folder, self.metrics, self.drawn, self.notes)
 
     def __str__(self) -> str:
-        head, rows = self._table(_METHODS)
-        names = [_NAMES.get(name, name) for name in head]
-        rows = [[peak, _NAMES.get(name, name), *cells] for peak, name, *cells in rows]
-        lines = [text_table(names, rows, words=2, title="Overlap with data (IoU, %)")]
+        table = self._table(_METHODS)
+        lines = [text_table(*table, words=2, title="Overlap with data (IoU, %)")]
         if peaks := self.metrics.held_out:
-            table = text_table(*self.metrics.main_table(peaks), words=2)
-            lines = [self.metrics.headline()[1], table, "", *lines]
+            main = text_table(*self.metrics.main_table(peaks), words=2)
+            lines = [self.metrics.headline()[1], main, "", *lines]
         for peak, scores in self.metrics.peaks.items():
             if scores.missing:
                 lines.append(f"{peak}: not scored, {scores.missing}")
@@ -275,15 +264,14 @@ class Report:
         from cpunet.html_pages import part
 
         (_, _, *methods), rows = self._table(_SHOWN)
-        rows = [[peak, name.replace("_", " "), *cells] for peak, name, *cells in rows]
-        head = ["peak", "overlap with data (%)", *(_NAMES.get(m, m) for m in methods)]
+        head = ["peak", "overlap with data (%)", *methods]
         where = {"page": None if self.folder is None else self.folder / PAGE}
         return part("object", "cpunet report", where, head, rows, self.verdicts)
 
     def _table(self, methods: Iterable[str]) -> tuple[list[str], list[list[str]]]:
         """IoU by peak and parameter, of the methods that have any."""
         of_all = {
-            (peak, parameter): compared.iou
+            (peak, _NAMES.get(parameter, parameter)): compared.iou
             for peak, scores in self.metrics.peaks.items()
             for parameter, compared in scores.parameters.items()
         }
@@ -292,7 +280,7 @@ class Report:
             [*place, *("–" if iou.get(m) is None else f"{iou[m]:.1f}" for m in shown)]
             for place, iou in of_all.items()
         ]
-        return ["peak", "parameter", *shown], rows
+        return ["peak", "parameter", *(_NAMES.get(m, m) for m in shown)], rows
 
 
 def read_metrics(file: Path, remedy: str = "validate the run again") -> Metrics:

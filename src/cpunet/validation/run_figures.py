@@ -36,8 +36,9 @@ from cpunet.plotting import (
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import LABELLED, data_axis
+from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import REFERENCE_KEV, Course, columns
-from cpunet.validation.comparisons import Compared, histogram
+from cpunet.validation.comparisons import Compared, finite_values, histogram
 from cpunet.validation.metrics import QUANTITIES, Metrics
 from cpunet.validation.noise import Spectrum
 from cpunet.validation.peaks import BEFORE_NS, MeanPulse
@@ -140,9 +141,7 @@ def parameter_histograms(
             share, of_data = (counts[m] / sizes[m] for m in (method, "data"))
             common = (counts[method] + counts["data"]) / (sizes[method] + sizes["data"])
             error = np.sqrt(common * (1 / sizes[method] + 1 / sizes["data"]))
-            pull = np.divide(
-                share - of_data, error, out=np.full_like(error, np.nan), where=error > 0
-            )
+            pull = (share - of_data) / np.where(error > 0, error, np.nan)
             steps(below, pull, axis.edges, method, label(method))
     sigma_panel(below)
     below.set_xlabel(axes.get_xlabel())
@@ -158,16 +157,15 @@ def sigma_panel(axes: Axes) -> None:
 
 
 @styled
-def overlap_figure(metrics: Metrics, peaks: Sequence[str]) -> Figure:
+def overlap_figure(metrics: Metrics) -> Figure:
     """Overlap with the data by quantity and method, and that of data with data as a band.
 
     Parameters
     ----------
     metrics
-        Content of ``metrics.json``.
-    peaks
-        Peaks, a panel each.
+        Content of ``metrics.json``; held-out peaks have a panel each.
     """
+    peaks = metrics.held_out
     figure, (grid,) = panels((1.2 + 4.2 * len(peaks), 3.6), 1, len(peaks), sharey=True)
     for axes, peak in zip(grid, peaks, strict=True):
         scores = metrics.peaks[peak]
@@ -296,13 +294,8 @@ def shape_figure(
                 mean = mean * (data.mean[-1] / mean[-1])
             line(above, time_ns, mean, method, label(method))
             if method != "data":
-                offset = mean - data.mean
-                error = np.full(len(offset), 0.01)
-                if data.n > 1:
-                    error = np.hypot(pulse.error, data.error)
-                pull = np.divide(
-                    offset, error, out=np.full_like(offset, np.nan), where=error > 0
-                )
+                error = np.hypot(pulse.error, data.error) if data.n > 1 else np.array(0.01)
+                pull = (mean - data.mean) / np.where(error > 0, error, np.nan)
                 line(below, time_ns, pull, method)
         most = max((pulse.n for method, pulse in pulses.items() if method != "data"), default=0)
         counts = f"{data.n} measured, {most} simulated pulses"
@@ -358,7 +351,7 @@ def nearest(aligned: FloatArray, target: FloatArray) -> tuple[int, float]:
 
 
 @styled
-def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figure:
+def roc_figure(ae: Mapping[str, Mapping[str, Values]]) -> Figure:
     """Survival of other peaks after low-A/E cuts, against the survival of the DEP.
 
     Parameters
@@ -366,25 +359,21 @@ def roc_figure(ae: Mapping[str, Mapping[str, Values]], dep: str = "DEP") -> Figu
     ae
         A/E of single pulses by peak and method, the measured ones under ``"data"``;
         non-finite values are left out.
-    dep
-        Name of the peak of single-site events.
     """
-    others = [peak for peak in ae if peak != dep]
-    methods = [m for m in ae[dep] if all(m in ae[peak] for peak in others)]
+    others = [peak for peak in ae if peak != DEP]
+    methods = [m for m in ae[DEP] if all(m in ae[peak] for peak in others)]
     size = (3.4 * len(others) + 0.6, 3.8)
     figure, (grid,) = panels(size, 1, len(others), sharey=True)
     accepted = np.linspace(0.0, 1.0, ROC_POINTS)
     for axes, peak in zip(grid, others, strict=True):
         for method in sorted(methods, key=lambda name: name == "ren"):
-            single, other = (
-                ae[name][method][np.isfinite(ae[name][method])] for name in (dep, peak)
-            )
+            single, other = (finite_values(ae[name][method]) for name in (DEP, peak))
             if not (single.size and other.size):
                 continue
             cuts = np.quantile(single, 1 - accepted)
             left = 1 - np.searchsorted(np.sort(other), cuts) / other.size
             line(axes, 100 * accepted, 100 * left, method, label(method))
-        axes.set(xlabel=f"{dep} that survives [%]", title=peak, xlim=ROC_RANGE)
+        axes.set(xlabel=f"{DEP} that survives [%]", title=peak, xlim=ROC_RANGE)
     # useful cuts leave few multi-site events
     grid[0].set(ylabel="Peak that survives [%]", yscale="log", ylim=(1, 100))
     grid[0].yaxis.set_major_formatter("{x:g}")
@@ -445,11 +434,9 @@ def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
         group(bars, method)
         if method != "data":
             # bands without noise in the data have no ratio
-            ratio, spread = (
-                np.divide(values, data, where=data > 0, out=np.full_like(data, np.nan))
-                for values in (power, error)
-            )
-            group(below.errorbar(spectrum.frequency_mhz, ratio, spread, **look), method)
+            usual = np.where(data > 0, data, np.nan)
+            bars = below.errorbar(spectrum.frequency_mhz, power / usual, error / usual, **look)
+            group(bars, method)
     below.axhline(1, color="black", linewidth=0.8)
     silent = not any(any(spectrum.power) for spectrum in drawn.values())
     above.set(

@@ -18,14 +18,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_inputs, written_aside
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.loading import (
-    InputSet,
-    load_pulses,
-    require_both_sides,
-    require_same_sampling,
-)
 from cpunet.pulses.parameters import Values, pulse_parameters
-from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
@@ -34,18 +27,13 @@ from cpunet.training.job import TrainingJob
 from cpunet.training.run import resolve_device
 from cpunet.training.unfinished import differences
 from cpunet.translation.translator import REN
-from cpunet.validation.comparisons import null_wasserstein, resampled_twice, wasserstein
+from cpunet.validation.bootstraps import Resampled
+from cpunet.validation.comparisons import NULL_NODES, drawn_distances, wasserstein
 from cpunet.validation.methods import like_data
 
 if TYPE_CHECKING:
-    from optuna import Study, Trial
-    from optuna.distributions import (
-        CategoricalDistribution,
-        FloatDistribution,
-        IntDistribution,
-    )
-
-    Distribution = CategoricalDistribution | FloatDistribution | IntDistribution
+    from optuna import Study
+    from optuna.distributions import BaseDistribution
 
 log = logging.getLogger(__name__)
 
@@ -63,7 +51,7 @@ def tune(
     sim: Source,
     data: Source,
     out: str | Path,
-    space: Mapping[str, Distribution],
+    space: Mapping[str, BaseDistribution],
     *,
     recipe: str | Path | Recipe = "fast",
     trials: int = 30,
@@ -104,63 +92,28 @@ def tune(
     """
     try:
         import optuna
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
     except ImportError as error:
         raise CpunetError(
             "tuning needs optuna, which is not installed; pip install 'cpunet-hpge[tune]'"
         ) from error
     optuna.logging.set_verbosity(optuna.logging.ERROR)
-    out, sides, recipe = Path(out), read.files(sim, data), load_recipe(recipe)
-    device = resolve_device(device, recipe)
+    out, pair, recipe = Path(out), read.files(sim, data), load_recipe(recipe)
     own = own_values(recipe, space)
-    refuse_inputs(out, *sides[0].files, *sides[1].files)
+    refuse_inputs(out, *pair[0].files, *pair[1].files)
     if out.exists() and not (out / JOURNAL).exists():
         raise CpunetError(f"{out}: exists already and holds no search; choose another name")
-    selection = parse_selection(peak, recipe.peaks)
-    measured = load_pulses(sides[1], "measured", recipe, selection, shorten=True)
-    recipe = measured.recipe  # with windows that the traces contain
-    simulated = load_pulses(sides[0], "simulated", recipe, selection)
-    require_same_sampling(simulated, measured)
-    require_both_sides(simulated, measured, selection)
-    held_out = HeldOut.of(simulated, measured, recipe, seed)
+    device = resolve_device(device, recipe)
+    job = TrainingJob.of(pair, recipe, peak, seed=seed, device=device)
+    held_out, recipe = HeldOut.of(job), job.data.recipe  # with windows that traces contain
     out.mkdir(parents=True, exist_ok=True)
     begun = {"recipe": recipe.model_dump(mode="json"), "peak": peak, "seed": seed}
     begun |= {"space": {key: str(of) for key, of in space.items()}}
-    begun |= {"simulation": simulated.fingerprint(), "data": measured.fingerprint()}
-    study = _study(out, begun)
-    if not study.trials and all(_contains(of, own[key]) for key, of in space.items()):
-        study.enqueue_trial(own)
-    ended = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
-    with stage("Trials", trials) as bar:
-        while (done := len(study.get_trials(states=ended))) < trials:
-            bar.update(done - bar.n)
-            trial = study.ask()
-            # trials have numbers of their own, so processes do not draw the same random ones
-            study.sampler = optuna.samplers.GPSampler(
-                seed=(seed + trial.number) % 2**32,
-                n_startup_trials=STARTS,
-                warn_independent_sampling=False,
-            )
-            values = {key: _suggested(trial, key, of) for key, of in space.items()}
-            try:
-                ren = held_out.train(read_settings(Recipe, recipe, values), seed, device)
-                study.tell(trial, held_out.score(ren))
-            except CpunetError as error:
-                trial.set_user_attr(REASON, str(error))
-                log.info(f"trial {trial.number} failed: {error}")
-                study.tell(trial, state=ended[1])
-        bar.update(done - bar.n)
-    _write(out, study, recipe)
-    return study
-
-
-def _study(out: Path, begun: Mapping[str, Any]) -> Study:
-    """The study of a folder, a new one or one that was begun with the same."""
-    import optuna
-    from optuna.storages.journal import JournalFileBackend
-
+    begun |= {"simulation": job.sim.fingerprint(), "data": job.data.fingerprint()}
     study = optuna.create_study(
         study_name="cpunet",
-        storage=optuna.storages.JournalStorage(JournalFileBackend(str(out / JOURNAL))),
+        storage=JournalStorage(JournalFileBackend(str(out / JOURNAL))),
         load_if_exists=True,
     )
     for difference in differences(study.user_attrs.get(BEGUN, begun), begun):
@@ -169,6 +122,29 @@ def _study(out: Path, begun: Mapping[str, Any]) -> Study:
             "choose another name"
         )
     study.set_user_attr(BEGUN, begun)
+    if own and not study.trials:
+        study.enqueue_trial(own)
+    ended = (optuna.trial.TrialState.COMPLETE, optuna.trial.TrialState.FAIL)
+    with stage("Trials", trials) as bar:
+        while (done := len(study.get_trials(states=ended))) < trials:
+            bar.update(done - bar.n)
+            # processes that share a search draw other random settings
+            number = len(study.trials)
+            study.sampler = optuna.samplers.GPSampler(
+                seed=(seed + number) % 2**32,
+                n_startup_trials=STARTS,
+                warn_independent_sampling=False,
+            )
+            trial = study.ask(dict(space))
+            try:
+                ren = held_out.train(read_settings(Recipe, recipe, trial.params))
+                study.tell(trial, held_out.score(ren))
+            except CpunetError as error:
+                trial.set_user_attr(REASON, str(error))
+                log.info(f"trial {trial.number} failed: {error}")
+                study.tell(trial, state=ended[1])
+        bar.update(done - bar.n)
+    _write(out, study, recipe)
     return study
 
 
@@ -191,8 +167,8 @@ def _write(out: Path, study: Study, recipe: Recipe) -> None:
         aside.write_text(yaml_text(tuned.model_dump(mode="json")), encoding="utf-8")
 
 
-def own_values(recipe: Recipe, space: Mapping[str, Distribution]) -> dict[str, Any]:
-    """The recipe's own values of a search space, after checking its settings and their values.
+def own_values(recipe: Recipe, space: Mapping[str, Any]) -> dict[str, Any]:
+    """The recipe's own values of a search space, which is checked; empty if it lacks a value.
 
     Raises
     ------
@@ -201,33 +177,21 @@ def own_values(recipe: Recipe, space: Mapping[str, Distribution]) -> dict[str, A
     """
     if not space:
         raise CpunetError("the search space is empty; give some settings in `space`")
-    values = dict(flat(recipe.model_dump(mode="json")))
+    values, own = dict(flat(recipe.model_dump(mode="json"))), {}
     for key, of in space.items():
         if key.split(".")[0] not in TUNED:
             raise CpunetError(f"space: {key}: only settings of {', '.join(TUNED)} can be tuned")
         if key not in values:
             raise CpunetError(f"space: {key}: there is no such setting")
-        for value in of.choices if hasattr(of, "choices") else (of.low, of.high):
+        ends = of.choices if hasattr(of, "choices") else (of.low, of.high)
+        for value in ends:
             try:
                 read_settings(Recipe, recipe, {key: value})
             except CpunetError as error:
                 raise CpunetError(f"space: {error}") from error
-    return {key: values[key] for key in space}
-
-
-def _contains(of: Distribution, value: Any) -> bool:
-    """Whether a distribution has a value."""
-    if hasattr(of, "choices"):
-        return value in of.choices
-    return isinstance(value, int | float) and of.low <= value <= of.high
-
-
-def _suggested(trial: Trial, key: str, of: Distribution) -> Any:
-    """The value of a setting proposed for a trial."""
-    if hasattr(of, "choices"):
-        return trial.suggest_categorical(key, of.choices)
-    suggest: Any = trial.suggest_int if isinstance(of.low, int) else trial.suggest_float
-    return suggest(key, of.low, of.high, step=of.step, log=of.log)
+        if values[key] in ends or (hasattr(of, "low") and of.low <= values[key] <= of.high):
+            own[key] = values[key]
+    return own if len(own) == len(space) else {}
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,24 +200,22 @@ class HeldOut:
 
     Parameters
     ----------
-    fit_sim, fit_data
-        Pulses for the training.
+    job
+        Training on the pulses to fit.
     sim, data
         Held-out pulses.
     values, nulls
         Parameters of the held-out data, and the null distance of each.
     """
 
-    fit_sim: InputSet
-    fit_data: InputSet
+    job: TrainingJob
     sim: Pulses
     data: Pulses
     values: dict[str, Values]
     nulls: dict[str, float]
-    seed: int
 
     @classmethod
-    def of(cls, sim: InputSet, data: InputSet, recipe: Recipe, seed: int) -> Self:
+    def of(cls, job: TrainingJob) -> Self:
         """Split both sides at random.
 
         Raises
@@ -261,8 +223,8 @@ class HeldOut:
         CpunetError
             If too few pulses would be held out.
         """
-        rng, sides = np.random.default_rng(seed), []
-        for side in (sim, data):
+        rng, fitted, held = np.random.default_rng(job.seed), [], []
+        for side in (job.sim, job.data):
             prepared = side.prepared
             rows, n = rng.permutation(len(prepared)), int(SHARE * len(prepared))
             if n < MIN_PULSES:
@@ -270,14 +232,18 @@ class HeldOut:
                     f"{side.path}: {len(prepared)} pulses, of which {n} would be held out, and "
                     f"{MIN_PULSES} are needed; select more energies (`peak`) or give more"
                 )
-            rest = replace(side, prepared=prepared[np.sort(rows[n:])])
-            sides.append((rest, prepared.pulses[np.sort(rows[:n])]))
-        (fit_sim, held_sim), (fit_data, held_data) = sides
-        values = pulse_parameters(held_data, recipe.preparation, recipe.scores)
-        n_sim, n_data = len(held_sim), len(held_data)
-        draws = resampled_twice(n_data, n_sim, n_data, recipe.scores.bootstraps, seed)
-        nulls = {name: null_wasserstein(v, draws)[0] for name, v in values.items()}
-        return cls(fit_sim, fit_data, held_sim, held_data, values, nulls, seed)
+            fitted.append(replace(side, prepared=prepared[np.sort(rows[n:])]))
+            held.append(prepared.pulses[np.sort(rows[:n])])
+        # what the continuum has is not held out
+        job = replace(job, peak="", sim=fitted[0], data=fitted[1], continuum=None)
+        values = pulse_parameters(held[1], job.recipe.preparation, job.recipe.scores)
+        rng, sizes = np.random.default_rng(job.seed), [len(pulses) for pulses in held]
+        draws = [Resampled(sizes[1], n, job.recipe.scores.bootstraps, rng) for n in sizes]
+        nulls = {
+            name: float(drawn_distances(v, v, draws, NULL_NODES).mean())
+            for name, v in values.items()
+        }
+        return cls(job, held[0], held[1], values, nulls)
 
     def score(self, ren: REN) -> float:
         r"""Distance of translated held-out pulses from data; 1 for two samples of the data.
@@ -292,7 +258,7 @@ class HeldOut:
         CpunetError
             If pulses cannot be translated.
         """
-        windows = like_data(ren, self.sim, np.random.default_rng(self.seed))
+        windows = like_data(ren, self.sim, np.random.default_rng(self.job.seed))
         whole = np.isfinite(windows).all(axis=1)
         if (lost := 1 - whole.mean()) > MAX_LOST:
             raise CpunetError(f"{100 * lost:.0f} % of the held-out pulses have no translation")
@@ -304,14 +270,7 @@ class HeldOut:
             raise CpunetError("a parameter of the held-out pulses has no value")
         return score
 
-    def train(self, recipe: Recipe, seed: int, device: str) -> REN:
-        """Train on the pulses that are not held out; see `cpunet.training.train`.
-
-        Raises
-        ------
-        CpunetError
-            If the training fails.
-        """
-        whole = recipe.at(self.fit_sim.dt_ns)
-        job = TrainingJob(whole, "", seed, device, self.fit_sim, self.fit_data)
-        return REN.of(job.trained(), device)
+    def train(self, recipe: Recipe) -> REN:
+        """Train on the pulses that are not held out; see `cpunet.training.train`."""
+        job = replace(self.job, recipe=recipe.at(self.job.sim.dt_ns))
+        return REN.of(job.trained(), job.device)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -118,10 +118,8 @@ def _validated(
     """Scores, and functions that draw; translated pulses are forgotten."""
     pair = run.sim.reading(pair[0]), run.data.reading(pair[1])
     read = (run.folder, *pair[0].files, *pair[1].files, truth)
-    with ExitStack() as stack:
-        aside = None
-        if out is not None:
-            aside = stack.enter_context(folder_written_aside(out, REPORT, *read, force=force))
+    written = folder_written_aside(out, REPORT, *read, force=force) if out else nullcontext()
+    with written as aside:
         # imported late: not needed for the help of the command
         from cpunet.validation.evaluation import evaluate
 
@@ -131,7 +129,8 @@ def _validated(
 
         notes = _notes(run, truth)
         drawn = drawings(evaluation)
-        report = Report(evaluation.metrics, evaluation.values, out, drawn, notes)
+        values = {peak.name: peak.values for peak in evaluation.sets if peak.values}
+        report = Report(evaluation.metrics, values, out, drawn, notes)
         del evaluation  # all pulses
         if aside is not None:
             report.write(aside)
