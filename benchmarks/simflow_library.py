@@ -67,7 +67,7 @@ def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
     """A/E of exactly drifted events, translated as a whole."""
     simulator, found = Simulator(read_detector(detector), SETTINGS), []
     translate = TemplateTranslator(REN.load(folder), 1.0)
-    for first in range(0, hits.n_events, 500):
+    for first in range(0, len(hits), 500):
         waveforms = simulator.events(hits[first : first + 500]).waveforms
         found.append(currents_about_peak(translate(waveforms))[0][..., PEAK] / mode)
     return np.concatenate(found)
@@ -109,7 +109,7 @@ def compare(folder: Path, detector: str, hits: Hits, path: Path) -> None:
         taken = time.monotonic() - begun
         quantiles = np.percentile(np.abs(apart), [50, 90, 99, 100])
         print(
-            f"  {hits.n_events} events, {title}: A/E apart by "
+            f"  {len(hits)} events, {title}: A/E apart by "
             + ", ".join(f"{q:.3f}" for q in quantiles)
             + f" % (50, 90, 99, 100 %); within 0.2 %: {100 * (np.abs(apart) < 0.2).mean():.2f}"
             f" %; reboost {taken:.0f} s",

@@ -104,7 +104,7 @@ def test_late_deposits_are_counted(tmp_path, caplog) -> None:
         time = TIME_NS.copy()
         time[1::9] += later_ns  # 20 us are longer than what one event lasts
         hits = read_hits(written(tmp_path, "vectors", steps(time=(time, "ns"))))
-        assert hits.n_events == n_events
+        assert len(hits) == n_events
         assert len(caplog.messages) == told
         text = f"{N // 3} events have deposits more than 50 ns after their first"
         assert all(text in message for message in caplog.messages)
@@ -274,7 +274,7 @@ def test_blocks_hold_all_events_of_a_window(tmp_path, monkeypatch) -> None:
 def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
     path = reference_data / "geant4" / "remage-th228-stp.lh5"
     hits = read_hits(path, HitOptions("det1"))
-    assert (hits.n_events, len(hits.edep_kev)) == (16, 342)
+    assert (len(hits), len(hits.edep_kev)) == (16, 342)
     assert hits.energy_kev[0] == pytest.approx(200.0)
     assert hits.event_number[:3].tolist() == [36, 45, 106]
     assert 10 < hits.x_mm.min() < hits.x_mm.max() < 50
@@ -294,7 +294,7 @@ def test_truncated_hdf5_is_one_line(reference_data: Path, tmp_path: Path) -> Non
 def test_geant4_csv_needs_units(reference_data: Path) -> None:
     path = reference_data / "geant4" / "single-invcoax-th228-geant4.csv"
     hits = read_hits(path, HitOptions(units="keV, mm"))
-    assert (hits.n_events, len(hits.edep_kev)) == (124, 1411)
+    assert (len(hits), len(hits.edep_kev)) == (124, 1411)
     assert hits.event_number[0] == 2
     assert 2500 < hits.energy_kev.max() < 2615
 

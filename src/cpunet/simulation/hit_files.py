@@ -14,21 +14,18 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.peaks import label_peaks
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.hit_tables import hit_format, step_tables
-from cpunet.simulation.hits import (
-    FARTHEST_MM,
-    LATE_NS,
-    MAX_KEV,
-    WINDOW_US,
-    FloatArray,
-    HitOptions,
-    Hits,
-    IntArray,
-)
+from cpunet.simulation.hit_tables import StepTable, hit_format, step_tables
+from cpunet.simulation.hits import FloatArray, HitOptions, Hits, IntArray
 from cpunet.tables import Lines, counted, span
 
 log = logging.getLogger(__name__)
 
+# Larger than any laboratory and any event.
+FARTHEST_MM, MAX_KEV = 1e7, 1e9
+# Deposits of an event number that come later are another event, as in remage.
+WINDOW_US = 10.0
+# Deposits of an event are simulated at once; later ones would change the edge of its pulse.
+LATE_NS = 50.0
 # Numbers in a row that rise, on average, in files of jobs
 _LONG_RISE = 3
 # the largest deposit of any source is above the first, the median event below the second
@@ -78,19 +75,7 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
             )
         if chosen is not None and chosen not in detectors:
             raise CpunetError(f"{file}: no detector {chosen}; it holds {names}")
-        table = detectors[chosen or next(iter(detectors))]
-        steps, origin = table.steps(options.units), table.origin_mm()
-    hits = _to_hits(file, steps, origin, options)
-    energy_kev = hits.energy_kev
-    if not len(hits):
-        raise CpunetError(f"{file}: no step deposits energy; check the detector's name")
-    if energy_kev.max() < _LEAST_KEV or np.median(energy_kev) > _MOST_KEV:
-        raise CpunetError(
-            f"{file}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
-            "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
-            "give `units` if it names none"
-        )
-    return hits
+        return _hits_of(detectors[chosen or next(iter(detectors))], options)
 
 
 def holds_hits(path: Path | str) -> bool:
@@ -103,9 +88,7 @@ def holds_hits(path: Path | str) -> bool:
     return False
 
 
-def _to_hits(
-    path: Path, steps: dict[str, npt.NDArray[Any]], origin_mm: FloatArray, options: HitOptions
-) -> Hits:
+def _hits_of(table: StepTable, options: HitOptions) -> Hits:
     """Group steps with a deposit by event (see `first_of_event`), in the order of the file.
 
     Positions are moved to the frame of the crystal. An event whose number an earlier one has
@@ -114,9 +97,11 @@ def _to_hits(
     Raises
     ------
     CpunetError
-        If a step has no finite position, time or energy, or a negative energy.
+        If a step has no finite position, time or energy, or a negative energy; if a hit is far
+        away, none is left, or energies are of another unit.
     """
-    position = np.stack([steps[axis] for axis in "xyz"], axis=1) - origin_mm
+    path, steps = table.path, table.steps(options.units)
+    position = np.stack([steps[axis] for axis in "xyz"], axis=1)
     event, edep = steps["event"], steps["edep"]
     time = steps.get("time", np.zeros(len(event)))
     # written so that NaN fails
@@ -128,10 +113,17 @@ def _to_hits(
             f"no energy of at least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km away or have "
             f"{MAX_KEV / 1e9:g} TeV); remove the event or simulate again"
         )
-    positive = edep > 0
-    largest = event.max(initial=-1)
-    event, edep = event[positive], edep[positive]
-    position, time = position[positive], time[positive]
+    positive, largest = edep > 0, event.max(initial=-1)
+    if not positive.any():
+        raise CpunetError(f"{path}: no step deposits energy; check the detector's name")
+    event, edep, time = event[positive], edep[positive], time[positive]
+    # from the frame of the file to that of the crystal
+    mirror = np.array([1.0, -1.0, -1.0]) if options.flip_z else np.ones(3)
+    position = (position[positive] - np.asarray(options.origin)) * mirror
+    if (farthest := np.abs(position).max()) > FARTHEST_MM:
+        raise CpunetError(
+            f"{path}: a hit lies {farthest:g} mm away; check the units and the origin"
+        )
     first = first_of_event(event, time)
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(first, kind="stable")
@@ -140,23 +132,21 @@ def _to_hits(
     again = np.ones(len(numbers), bool)
     again[np.unique(numbers, return_index=True)[1]] = False
     numbers[again] = largest + 1 + np.arange(again.sum())
-    # from the frame of the file to that of the crystal
-    mirror = np.array([1.0, -1.0, -1.0]) if options.flip_z else np.ones(3)
-    hits = Hits.of(
-        (position[order] - np.asarray(options.origin)) * mirror,
-        edep[order],
-        np.concatenate([[0], np.cumsum(counts)]),
-        numbers,
-    )
-    if len(hits):
-        times, begins = time[order], hits.offsets[:-1]
-        spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
-        if late := int((spread > LATE_NS).sum()):
-            log.warning(
-                f"{path}: {late} events have deposits more than {LATE_NS:g} ns after their "
-                "first, simulated as if at once; if these are other events, give them numbers "
-                "of their own"
-            )
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    hits = Hits.of(position[order], edep[order], offsets, numbers)
+    times, begins, energy_kev = time[order], offsets[:-1], hits.energy_kev
+    spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
+    if late := int((spread > LATE_NS).sum()):
+        log.warning(
+            f"{path}: {late} events have deposits more than {LATE_NS:g} ns after their first, "
+            "simulated as if at once; if these are other events, give them numbers of their own"
+        )
+    if energy_kev.max() < _LEAST_KEV or np.median(energy_kev) > _MOST_KEV:
+        raise CpunetError(
+            f"{path}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
+            "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
+            "give `units` if it names none"
+        )
     return hits
 
 
@@ -173,7 +163,21 @@ def first_of_event(number: IntArray, time_ns: FloatArray) -> IntArray:
     >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), np.zeros(6))
     array([0, 1, 2, 3, 4, 5])
     """
-    job = _job_of_step(number)
+    # Numbers of a job rise. An event that a thread wrote in two blocks ends one such rise and
+    # begins another; where more come back otherwise, the numbering has started anew. Rows in
+    # another order, as that of time, rise and fall all the time (by two on average).
+    starts = np.flatnonzero(np.append(True, np.diff(number) != 0)[: len(number)])
+    runs = number[starts]
+    falls = np.diff(runs) < 0
+    begins, ends = np.append(True, falls), np.append(falls, True)
+    order = np.argsort(runs, kind="stable")
+    again = np.diff(runs[order]) == 0
+    again &= ~(ends[order[:-1]] & begins[order[1:]])
+    job_of_run = np.zeros(len(runs), np.int64)
+    if again.sum() > 1 and len(runs) >= _LONG_RISE * begins.sum():
+        job_of_run[order[1:]] = np.cumsum(again)
+    job = np.repeat(job_of_run, np.diff(np.append(starts, len(number))))
+
     order = np.lexsort((time_ns, job, number))
     new = (np.diff(number[order]) != 0) | (np.diff(job[order]) != 0)
     new |= np.diff(time_ns[order]) > 1000 * WINDOW_US
@@ -182,26 +186,6 @@ def first_of_event(number: IntArray, time_ns: FloatArray) -> IntArray:
     counts = np.diff(np.append(starts, len(number)))
     first[order] = np.repeat(np.minimum.reduceat(order, starts), counts)
     return first
-
-
-def _job_of_step(number: IntArray) -> IntArray:
-    """Index of the job of each step among those with its number.
-
-    The numbers of a job rise. An event that a thread wrote in two blocks ends one such rise and
-    begins another; where more come back otherwise, the numbering has started anew. Rows in
-    another order, as that of time, rise and fall all the time (by two on average).
-    """
-    starts = np.flatnonzero(np.append(True, np.diff(number) != 0)[: len(number)])
-    runs = number[starts]
-    falls = np.diff(runs) < 0
-    begins, ends = np.append(True, falls), np.append(falls, True)
-    order = np.argsort(runs, kind="stable")
-    again = np.diff(runs[order]) == 0
-    again &= ~(ends[order[:-1]] & begins[order[1:]])
-    job = np.zeros(len(runs), np.int64)
-    if again.sum() > 1 and len(runs) >= _LONG_RISE * begins.sum():
-        job[order[1:]] = np.cumsum(again)
-    return np.repeat(job, np.diff(np.append(starts, len(number))))
 
 
 def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
@@ -244,13 +228,13 @@ def describe_hits(
     """
     detectors: dict[str, Lines] = {}
     with step_tables(path) as tables:
-        names = [*tables]
-    for name in names:
-        try:
-            hits = read_hits(path, HitOptions(name or None, units=units))
-        except CpunetError as error:
-            detectors[name] = [("hits", str(error).removeprefix(f"{path}: "))]
-            continue
+        hits_of: dict[str, Hits] = {}
+        for name, table in tables.items():
+            try:
+                hits_of[name] = _hits_of(table, HitOptions(units=units))
+            except CpunetError as error:
+                detectors[name] = [("hits", str(error).removeprefix(f"{path}: "))]
+    for name, hits in hits_of.items():
         lines = label_peaks(hits.energy_kev, peaks)
         places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
         extents = (

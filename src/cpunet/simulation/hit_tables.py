@@ -7,7 +7,6 @@ import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Literal
 
@@ -19,7 +18,6 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import item_at, members, opened, units_of
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.pulses.reading.columns import divides, dividing, labels, texts, whole_numbers
-from cpunet.simulation.hits import FloatArray, IntArray
 from cpunet.units import factor, unit_names
 
 HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
@@ -44,13 +42,13 @@ _ARRAYS = {f"{axis}_mm": f"{axis}_in_mm" for axis in "xyz"} | {"edep_keV": "edep
 
 @dataclass(frozen=True)
 class StepTable:
-    """A table of steps: its columns by name, arrays or items of an open HDF5 file.
+    """Steps of a detector: columns by name, arrays or items of an open HDF5 file.
 
     Those of HDF5 are arrays with a value per row, or vectors with a value per step of the row;
     the vectors of deposits give the steps of each row. The `name` is that of the detector,
     empty without any. `units` are those of columns that name none: MeV and mm in tables of
     g4simple. A `file` of remage tells where its detectors are. Where detectors share the table,
-    `labels` are those of the steps, and those with the `label` are read.
+    `labels` are those of the steps, and those with the name are read.
     """
 
     path: Path
@@ -58,7 +56,6 @@ class StepTable:
     name: str = ""
     units: str = ""
     file: h5py.File | None = None
-    label: str = ""
     labels: npt.NDArray[np.str_] | None = None
 
     def by_detector(self) -> dict[str, StepTable]:
@@ -66,18 +63,22 @@ class StepTable:
 
         Labels without deposits are the world or a holder.
         """
-        if "edep" not in self._roles:
-            return {self.name: self}
-        deposits = self._read(self._roles["edep"][0])[0] > 0
-        of = {name: self._read(name)[0] for name in self.columns if divides(name)}
-        some = {name: values[deposits] for name, values in of.items()}
-        names = dividing(some, int(deposits.sum())) or list(of)[:1]
+        of = roles(self.columns)
+        if missing := [role for role in _NEEDED if role not in of]:
+            raise CpunetError(
+                f"{self.path}: no column for {missing[0]}; "
+                f"the file holds {', '.join(self.columns)}"
+            )
+        deposits = self._read(of["edep"][0])[0] > 0
+        dividers = {name: self._read(name)[0] for name in self.columns if divides(name)}
+        some = {name: values[deposits] for name, values in dividers.items()}
+        names = dividing(some, int(deposits.sum())) or list(dividers)[:1]
         if not names:
             return {self.name: self}
-        of_steps = texts(of[names[0]]) if len(names) == 1 else labels(of, names)
+        of_steps = texts(dividers[names[0]]) if len(names) == 1 else labels(dividers, names)
         detectors = sorted(map(str, np.unique(of_steps[deposits])), key=lambda x: (len(x), x))
         if len(detectors) > 1 or (detectors and not self.name):
-            return {label: replace(self, label=label, labels=of_steps) for label in detectors}
+            return {label: replace(self, name=label, labels=of_steps) for label in detectors}
         return {self.name: self}
 
     def steps(self, units: str) -> dict[str, npt.NDArray[Any]]:
@@ -86,22 +87,17 @@ class StepTable:
         Returns
         -------
         dict
-            ``event`` numbers, ``x``, ``y``, ``z`` (mm) in the frame of the file, ``edep`` (keV)
-            and, if the file has them, ``time`` (ns).
+            ``event`` numbers, ``x``, ``y``, ``z`` (mm) from the origin of the detector, or of
+            the file if it tells none, ``edep`` (keV) and, if the file has them, ``time`` (ns).
 
         Raises
         ------
         CpunetError
-            If a column is missing, is no number or names no known unit.
+            If a column is no number or names no known unit.
         """
-        if missing := [role for role in _NEEDED if role not in self._roles]:
-            raise CpunetError(
-                f"{self.path}: no column for {missing[0]}; "
-                f"the file holds {', '.join(self.columns)}"
-            )
-        chosen = slice(None) if self.labels is None else self.labels == self.label
+        chosen = slice(None) if self.labels is None else self.labels == self.name
         steps: dict[str, npt.NDArray[Any]] = {}
-        for role, (name, in_name) in self._roles.items():
+        for role, (name, in_name) in roles(self.columns).items():
             values, unit = self._read(name)
             where = f"{self.path}: column {name}"
             if values.ndim != 1 or values.dtype.kind not in "iuf":
@@ -115,47 +111,35 @@ class StepTable:
                 given = unit or in_name, *re.split(r"[\s,]+", units), *self.units.split(",")
                 values = values * _unit_factor(role, where, given)
             steps[role] = values[chosen]
+            origin = f"detector_origins/{self.name}/{role}loc"
+            if self.file is not None and origin in self.file:
+                # it may lack a unit; all lengths of remage are in m
+                item, where = self.file[origin], f"{self.path}: column {origin}"
+                to_mm = _unit_factor(role, where, (units_of(item), "m"))
+                steps[role] = steps[role] - item[()].item() * to_mm
         return steps
-
-    def origin_mm(self) -> FloatArray:
-        """Origin of the detector in mm; zero if it is not in the file."""
-        origin = np.zeros(3)
-        for i, axis in enumerate("xyz"):
-            where = f"detector_origins/{self.label or self.name}/{axis}loc"
-            if self.file is not None and where in self.file:
-                # an origin may lack a unit; all lengths of remage are in m
-                given = units_of(self.file[where]), "m"
-                to_mm = _unit_factor("x", f"{self.path}: column {where}", given)
-                origin[i] = self.file[where][()].item() * to_mm
-        return origin
-
-    @cached_property
-    def _roles(self) -> dict[str, tuple[str, str]]:
-        return roles(self.columns)
-
-    @cached_property
-    def _per_row(self) -> IntArray:
-        """Number of steps of each row."""
-        edep = self.columns[self._roles["edep"][0]]
-        return _lengths(edep) if _has(edep, *_VECTORS) else np.ones(len(edep), np.int64)
 
     def _read(self, name: str) -> tuple[npt.NDArray[Any], str]:
         """Values of a column for all steps, and the unit that belongs to them."""
-        item = self.columns[name]
+        item, edep = self.columns[name], self.columns[roles(self.columns)["edep"][0]]
         if isinstance(item, np.ndarray):
             return item, ""
-        per_row, vectors = self._per_row, _has(item, *_VECTORS)
-        where = f"{self.path}: column"
+        where, vectors = f"{self.path}: column", _has(item, *_VECTORS)
         if not vectors and not (isinstance(item, h5py.Dataset) and item.ndim == 1):
             raise CpunetError(f"{where} {name} is no array with a value per step or hit")
-        same = np.array_equal(_lengths(item), per_row) if vectors else len(item) == len(per_row)
-        if not same:
+        # each row ends with one of the steps
+        ends, of_edep = (
+            column["cumulative_length"][()].astype(np.int64)
+            if _has(column, *_VECTORS)
+            else np.arange(len(column)) + 1
+            for column in (item, edep)
+        )
+        if len(ends) != len(of_edep) or (vectors and not np.array_equal(ends, of_edep)):
             raise CpunetError(f"{where}s {name} and edep differ in length; truncated?")
-        unit = units_of(item)
         if not vectors:
-            return np.repeat(item[()], per_row), unit
+            return np.repeat(item[()], np.diff(of_edep, prepend=0)), units_of(item)
         flat = item["flattened_data"]
-        return np.asarray(flat[: per_row.sum()]), units_of(flat) or unit
+        return np.asarray(flat[: ends.max(initial=0)]), units_of(flat) or units_of(item)
 
 
 def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
@@ -236,14 +220,12 @@ def step_tables(path: Path) -> Iterator[dict[str, StepTable]]:
             f"{NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
         )
     with opened(path) as file:
-        folders = [item_at(file, folder) for folder in (STEPS, NTUPLES)]
-        groups = [
-            item for held in folders if held is not None for item in members(held).items()
-        ]
-        if kind == "stored":
-            groups = [("", file[HIT_TABLE])]
+        groups = {"": file[HIT_TABLE]} if kind == "stored" else {}
+        for folder in (STEPS, NTUPLES):
+            if kind == "tables" and (held := item_at(file, folder)) is not None:
+                groups |= members(held)
         tables: dict[str, StepTable] = {}
-        for name, group in groups:
+        for name, group in groups.items():
             if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys():
                 # the values of a column of Geant4's HDF5 are its pages
                 columns = {
@@ -251,7 +233,7 @@ def step_tables(path: Path) -> Iterator[dict[str, StepTable]]:
                     for key, item in members(group).items()
                 }
                 # g4simple writes one table for all detectors
-                of = ("", _G4SIMPLE_UNITS) if name == _G4SIMPLE else (str(name), "")
+                of = ("", _G4SIMPLE_UNITS) if name == _G4SIMPLE else (name, "")
                 tables |= StepTable(path, columns, *of, file).by_detector()
         if not tables:
             raise CpunetError(
@@ -263,11 +245,6 @@ def step_tables(path: Path) -> Iterator[dict[str, StepTable]]:
 
 def _has(item: Any, *parts: str) -> bool:
     return isinstance(item, h5py.Group) and all(part in item for part in parts)
-
-
-def _lengths(vectors: h5py.Group) -> IntArray:
-    ends = vectors["cumulative_length"][()].astype(np.int64)
-    return np.asarray(np.diff(ends, prepend=0), np.int64)
 
 
 def _npz_table(path: Path) -> StepTable:
@@ -289,7 +266,7 @@ def _npz_table(path: Path) -> StepTable:
 
 def _csv_table(path: Path) -> StepTable:
     """A CSV ntuple of Geant4, or several in one file; g4simple's is recognised by its title."""
-    from pandas import DataFrame, read_csv  # half a second, which other formats do not need
+    from pandas import read_csv  # half a second, which other formats do not need
 
     with path.open(encoding="utf-8", errors="replace") as lines:
         headers = {n: line for n, line in enumerate(lines) if line.startswith("#")}
@@ -297,13 +274,10 @@ def _csv_table(path: Path) -> StepTable:
     header = [line[1:].strip().partition(" ")[::2] for line in first]
     names = [value.partition(" ")[2] for key, value in header if key == "column"]
     about = {"title": "", "separator": str(ord(","))} | dict(header)
-    separator = chr(int(about["separator"]))
+    how: dict[str, Any] = {"sep": chr(int(about["separator"])), "encoding_errors": "replace"}
     try:
         # the columns of one file can be numbers, text or both
-        cells: DataFrame = read_csv(
-            path, sep=separator, header=None, skiprows=[*headers], low_memory=False,
-            encoding_errors="replace",
-        )  # fmt: skip
+        cells = read_csv(path, header=None, skiprows=[*headers], low_memory=False, **how)
     except ValueError as error:
         raise CpunetError(f"{path}: holds no steps ({error}); export again") from error
     if (n := cells.shape[1]) != len(names):
