@@ -59,7 +59,9 @@ def events_of(path: Path, detector: str) -> Hits:
     """Events above 600 keV: their hits merged, those in the lithium left out."""
     hits = read_hits(path)
     hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)], 0.05)
-    hits = hits.where(read_detector(detector).active(hits.r_mm, hits.z_mm))
+    active = read_detector(detector).active(hits.r_mm, hits.z_mm)
+    ends = np.append(0, np.cumsum(active))[hits.offsets]
+    hits = Hits.of(hits.position_mm[active], hits.edep_kev[active], ends, hits.event_number)
     return hits[np.flatnonzero(np.diff(hits.offsets) > 0)]
 
 

@@ -31,6 +31,7 @@ from cpunet.simulation.gammas.sample import (
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits
+from cpunet.simulation.outline import outline_of
 
 
 def crystal(**changed: float) -> Detector:
@@ -185,7 +186,8 @@ def test_compton_mean_energy_is_that_of_klein_and_nishina() -> None:
 
 
 def test_deposits_for_which_there_is_no_room_are_counted() -> None:
-    medium, counts = Medium.of(crystal()), []
+    medium = Medium(outline_of(crystal()), photon_table(), electron_table())
+    counts = []
     for room in (3, 2000):
         event = Event(np.empty((room, 4)), np.empty((256, 7)), np.zeros(3, np.int64))
         put_photon(event, 20.0, 0.0, 50.0, UnitVector(0.0, 0.0, -1.0), 2.6145)

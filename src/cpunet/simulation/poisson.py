@@ -16,7 +16,6 @@ charges and electrode potentials takes only hundredths of a second.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,22 +82,23 @@ def make_grid(detector: Detector) -> Grid:
         z_mm=z,
         step_mm=h,
         region=region,
-        r_steps=_steps(detector, rr, zz, region, axis=0),
-        z_steps=_steps(detector, rr, zz, region, axis=1),
+        r_steps=_steps(detector, rr, zz, region),
+        z_steps=_steps(detector, rr.T, zz.T, region.T).T,
     )
 
 
 def _steps(
-    detector: Detector, rr: FloatArray, zz: FloatArray, region: RegionArray, axis: int
+    detector: Detector, rr: FloatArray, zz: FloatArray, region: RegionArray
 ) -> FloatArray:
-    """Fractions of the steps along `axis` that lie outside the contacts."""
-    low, high = _ends(region, axis)
-    steps = np.ones(low.shape)
-    crossing = (low <= LI_CONTACT) != (high <= LI_CONTACT)
-    # ends (low and high), coordinates (r and z), steps that cross a surface
-    nodes = np.stack([_ends(rr, axis), _ends(zz, axis)], axis=1)[..., crossing]
+    """Fractions of the steps along the first axis that lie outside the contacts."""
+    contact = region <= LI_CONTACT
+    crossing = contact[:-1] != contact[1:]
+    # ends (low and high) and coordinates (r and z) of the steps that cross a surface
+    low, high = (
+        np.stack([x[ends][crossing] for x in (rr, zz)]) for ends in (np.s_[:-1], np.s_[1:])
+    )
     # start at the node outside the contact
-    start, end = np.where(low[crossing] <= LI_CONTACT, nodes[::-1], nodes)
+    start, end = np.where(contact[:-1][crossing], [high, low], [low, high])
     outside, inside = np.zeros(crossing.sum()), np.ones(crossing.sum())
     for _ in range(_BISECTIONS):
         middle = (outside + inside) / 2
@@ -106,12 +106,9 @@ def _steps(
         inside = np.where(hit, middle, inside)
         outside = np.where(hit, outside, middle)
     # a surface on the node itself counts as a full step: exact where grid and contact meet
+    steps = np.ones(crossing.shape)
     steps[crossing] = np.clip(np.where(inside > 1 - 2 * _NEAREST, 1, inside), _NEAREST, 1)
     return steps
-
-
-def _ends(values: npt.NDArray[Any], axis: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    return (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
 
 
 EPSILON_GERMANIUM = 16.0
@@ -207,7 +204,9 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     bias = solved((grid.region == LI_CONTACT).astype(float), nothing)
     impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
     impurities = solved(nothing, charges(detector, grid, impurity))
-    tilt = solved(nothing, charges(detector, grid, detector.per_tilt_cm(grid.z_mm)))
+    tilt = solved(
+        nothing, charges(detector, grid, (grid.z_mm - detector.crystal_length / 2) / 10)
+    )
     surface = nothing
     if detector.surface_charge_1e10_per_cm2:
         surface = solved(nothing, surface_charges(detector, grid))

@@ -197,15 +197,6 @@ class UnitVector(NamedTuple):
 
 
 @kernel(error_model="numpy")
-def isotropic(rng: np.random.Generator) -> UnitVector:
-    """Draw an isotropic direction."""
-    cosine = 2.0 * rng.random() - 1.0
-    sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
-    azimuth = 2.0 * math.pi * rng.random()
-    return UnitVector(sine * math.cos(azimuth), sine * math.sin(azimuth), cosine)
-
-
-@kernel(error_model="numpy")
 def turned(axis: UnitVector, cosine: float, azimuth: float) -> UnitVector:
     """Direction at a polar angle and an azimuth (rad) relative to an axis."""
     sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
@@ -373,7 +364,7 @@ def slow_down(
         length = part * table.step[row]
         hinge = length * rng.random()
         x, y, z = x + hinge * direction.x, y + hinge * direction.y, z + hinge * direction.z
-        if not in_germanium(outline, x, y, z):
+        if not in_germanium(outline, x, y, z, 0.0):
             return
         record(event, x, y, z, kinetic - table.energy[row + 1])
         kinetic = table.energy[row + 1]
@@ -382,7 +373,7 @@ def slow_down(
         direction = turned(direction, cosine, 2.0 * math.pi * rng.random())
         rest = length - hinge
         x, y, z = x + rest * direction.x, y + rest * direction.y, z + rest * direction.z
-        if not in_germanium(outline, x, y, z):
+        if not in_germanium(outline, x, y, z, 0.0):
             return
         chance = rng.random()
         if chance < part * table.brems[row]:
@@ -408,7 +399,8 @@ def slow_down(
         row, part = row + 1, 1.0
     record(event, x, y, z, kinetic)
     if positron:
-        first = isotropic(rng)
+        cosine, up = 2.0 * rng.random() - 1.0, UnitVector(0.0, 0.0, 1.0)
+        first = turned(up, cosine, 2.0 * math.pi * rng.random())
         put_photon(event, x, y, z, first, ELECTRON_MASS)
         second = UnitVector(-first.x, -first.y, -first.z)
         put_photon(event, x, y, z, second, ELECTRON_MASS)

@@ -51,26 +51,12 @@ MAX_HITS, MAX_PHOTONS = 2000, 256
 """Maximum numbers of hits and of photons per event; Tl-208 gives about 200 hits."""
 
 
-class SourceDisc(NamedTuple):
-    """A disc above the crystal that emits into the cone around the top of the crystal."""
-
-    energy: float
-    height: float
-    radius: float
-    least_cosine: float
-
-
 class Medium(NamedTuple):
-    """A crystal, and the tables of photons and electrons in germanium."""
+    """A crystal with its lithium layer, and tables of photons and electrons in germanium."""
 
     outline: Outline
     photons: PhotonTable
     electrons: ElectronTable
-
-    @classmethod
-    def of(cls, detector: Detector) -> Medium:
-        """The crystal of a detector; its lithium layer is treated as germanium."""
-        return cls(outline_of(detector), photon_table(), electron_table())
 
 
 @kernel(error_model="numpy")
@@ -90,7 +76,7 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
         direction = UnitVector(row[3], row[4], row[5])
         while True:
             if energy < PHOTON_CUT:
-                if in_germanium(outline, x, y, z):
+                if in_germanium(outline, x, y, z, 0.0):
                     record(event, x, y, z, energy)
                 break
             at = (math.log(energy) - photons.log_first) * photons.per_log
@@ -104,7 +90,7 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
                 or x * x + y * y > outline.crystal_radius**2
             ):
                 break
-            if not in_germanium(outline, x, y, z):
+            if not in_germanium(outline, x, y, z, 0.0):
                 continue
             place, chance = (x, y, z), rng.random()
             if chance < photons.photoelectric[node]:
@@ -132,57 +118,49 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
 
 
 @kernel(error_model="numpy")
-def way_to_cylinder(
-    outline: Outline, x: float, y: float, z: float, direction: UnitVector
-) -> float:
-    """Distance in mm from a point above the crystal to its enclosing cylinder; -1 if missed."""
+def emit(
+    outline: Outline,
+    source: tuple[float, float, float, float],
+    event: Event,
+    rng: np.random.Generator,
+) -> None:
+    """Place a photon where it meets the cylinder around the crystal; none if it misses.
+
+    The source is a disc above the crystal that emits into a cone about the axis: energy (MeV),
+    height above the crystal and radius (mm), and cosine of the cone's half angle.
+    """
+    energy, height, disc, least_cosine = source
     radius, length = outline.crystal_radius, outline.crystal_length
-    u, v, w = direction
-    if w >= 0.0:
-        return -1.0
-    t = (length - z) / w
-    if (x + t * u) ** 2 + (y + t * v) ** 2 <= radius**2:
-        return t
-    a = u * u + v * v
-    b = x * u + y * v
-    c = x * x + y * y - radius**2
-    inside_root = b * b - a * c
-    if a == 0.0 or inside_root <= 0.0:
-        return -1.0
-    t = (-b - math.sqrt(inside_root)) / a
-    height = z + t * w
-    return t if t > 0.0 and 0.0 <= height <= length else -1.0
-
-
-@kernel(error_model="numpy")
-def emit(outline: Outline, source: SourceDisc, event: Event, rng: np.random.Generator) -> None:
-    """Place a photon where it meets the cylinder of the crystal; none if it misses."""
-    r = source.radius * math.sqrt(rng.random())
+    r = disc * math.sqrt(rng.random())
     around = 2.0 * math.pi * rng.random()
-    x, y, z = r * math.cos(around), r * math.sin(around), outline.crystal_length + source.height
-    cosine = source.least_cosine + (1.0 - source.least_cosine) * rng.random()
+    x, y, z = r * math.cos(around), r * math.sin(around), length + height
+    cosine = least_cosine + (1.0 - least_cosine) * rng.random()
     down = turned(UnitVector(0.0, 0.0, -1.0), cosine, 2.0 * math.pi * rng.random())
-    way = way_to_cylinder(outline, x, y, z, down)
-    if way >= 0.0:
-        way += 1e-9  # rounding must not leave it just outside, where it would count as lost
-        x, y, z = x + way * down.x, y + way * down.y, z + way * down.z
-        put_photon(event, x, y, z, down, source.energy)
-
-
-class Windows(NamedTuple):
-    """Windows of energy (MeV), and the numbers of events still missing in each."""
-
-    low: Array
-    high: Array
-    missing: Integers
+    u, v, w = down
+    if w >= 0.0:
+        return
+    way = (length - z) / w
+    if (x + way * u) ** 2 + (y + way * v) ** 2 > radius**2:  # not on the top: on the side?
+        a = u * u + v * v
+        b = x * u + y * v
+        c = x * x + y * y - radius**2
+        inside_root = b * b - a * c
+        if a == 0.0 or inside_root <= 0.0:
+            return
+        way = (-b - math.sqrt(inside_root)) / a
+        if not (way > 0.0 and 0.0 <= z + way * w <= length):
+            return
+    way += 1e-9  # rounding must not leave it just outside, where it would count as lost
+    put_photon(event, x + way * u, y + way * v, z + way * w, down, energy)
 
 
 @kernel(error_model="numpy")
 def simulate_block(
     medium: Medium,
-    source: SourceDisc,
+    source: tuple[float, float, float, float],
     n_primaries: int,
-    windows: Windows,
+    windows: Array,
+    missing: Integers,
     rng: np.random.Generator,
     hits: Array,
     offsets: Integers,
@@ -190,9 +168,10 @@ def simulate_block(
 ) -> tuple[int, int, int]:
     """Simulate until the primaries, the space for hits or the missing events run out.
 
-    An event counts if it lies in a window that still misses events, or always if there are
-    no windows. Returns the numbers of primaries done, of events chosen, and of events left out
-    because they have more than `MAX_HITS` deposits.
+    An event counts if it lies in one of the `windows` (low and high in MeV) of which events
+    are still `missing`, or always if there are no windows. Returns the numbers of primaries
+    done, of events chosen, and of events left out because they have more than `MAX_HITS`
+    deposits.
     """
     photons, counts = np.empty((MAX_PHOTONS, 7)), np.zeros(3, np.int64)
     n_kept = n_left_out = 0
@@ -200,7 +179,7 @@ def simulate_block(
     for primary in range(n_primaries):
         start = offsets[n_kept]
         full = len(hits) - start < MAX_HITS or n_kept == len(primaries)
-        if full or (len(windows.missing) > 0 and windows.missing.sum() == 0):
+        if full or (len(missing) > 0 and missing.sum() == 0):
             return primary, n_kept, n_left_out
         counts[:] = 0
         event = Event(hits[start : start + MAX_HITS], photons, counts)
@@ -214,11 +193,10 @@ def simulate_block(
             energy += event.hits[i, 3]
         if energy == 0.0:
             continue
-        keep = len(windows.missing) == 0
-        for line in range(len(windows.missing)):
-            within = windows.low[line] <= energy <= windows.high[line]
-            if windows.missing[line] > 0 and within:
-                windows.missing[line] -= 1
+        keep = len(missing) == 0
+        for line in range(len(missing)):
+            if missing[line] > 0 and windows[line, 0] <= energy <= windows[line, 1]:
+                missing[line] -= 1
                 keep = True
                 break
         if keep:
@@ -301,17 +279,13 @@ def simulate_gammas(
                 f"{line.name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
                 f"the {energy_kev} keV line; give another"
             )
-    medium = Medium.of(detector)
-    reach = detector.crystal_radius + source_radius_mm
-    cosine = source_height_mm / math.hypot(source_height_mm, reach)
-    source = SourceDisc(
-        energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine
-    )
+    medium = Medium(outline_of(detector), photon_table(), electron_table())
+    height, radius = float(source_height_mm), float(source_radius_mm)
+    cosine = height / math.hypot(height, detector.crystal_radius + radius)
+    source = energy_kev / 1e3, height, radius, cosine
     # the sum of deposits equals the energy of the line only up to rounding
-    low = np.array([line.low_kev / 1e3 - 1e-9 for line in wanted])
-    high = np.array([line.high_kev / 1e3 + 1e-9 for line in wanted])
-    missing = np.array(list(wanted.values()), np.int64)
-    windows = Windows(low, high, missing)
+    edges = [(line.low_kev / 1e3 - 1e-9, line.high_kev / 1e3 + 1e-9) for line in wanted]
+    windows, missing = np.array(edges).reshape(-1, 2), np.array([*wanted.values()], np.int64)
     rng = np.random.default_rng(seed)
     hits = np.empty((min(_BLOCK_HITS, MAX_HITS + 300 * n_primaries), 4))
     offsets = np.zeros(_BLOCK_EVENTS + 1, np.int64)
@@ -320,7 +294,7 @@ def simulate_gammas(
     done = left_out = 0
     while done < n_primaries and not (wanted and missing.sum() == 0):
         tried, n_chosen, large = simulate_block(
-            medium, source, n_primaries - done, windows, rng, hits, offsets, primaries
+            medium, source, n_primaries - done, windows, missing, rng, hits, offsets, primaries
         )
         ends = offsets[: n_chosen + 1].copy()
         deposits = hits[: ends[-1]]
