@@ -11,23 +11,20 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.gammas.electrons import (
+from cpunet.simulation.gammas.sample import (
     HITS,
     LOST,
-    Event,
-    UnitVector,
-    compton_energy,
-    electron_table,
-    photon_table,
-    put_photon,
-)
-from cpunet.simulation.gammas.sample import (
     TL208_KEV,
     EnergyWindow,
+    Event,
     Medium,
+    UnitVector,
+    compton_energy,
     follow_photons,
+    put_photon,
     simulate_gammas,
 )
+from cpunet.simulation.gammas.tables import electron_table, photon_table
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits

@@ -41,21 +41,15 @@ def places(
 ) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
     """`Detector.region` and `Detector.inside` at places of a detector."""
     r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
-    region, inside = np.empty(r.shape, np.int8), np.empty(r.shape, np.bool_)
-    _fill(
-        outline_of(detector), r.flatten(), z.flatten(), region.reshape(-1), inside.reshape(-1)
-    )
-    return region, inside
+    values = np.empty((2, r.size), np.int8)
+    _fill(outline_of(detector), r.flatten(), z.flatten(), values)
+    return values[0].reshape(r.shape), values[1].reshape(r.shape).astype(np.bool_)
 
 
 @kernel(error_model="numpy")
-def _fill(
-    outline: Outline,
-    r: Array,
-    z: Array,
-    region: npt.NDArray[np.int8],
-    inside: npt.NDArray[np.bool_],
-) -> None:
+def _fill(outline: Outline, r: Array, z: Array, values: npt.NDArray[np.int8]) -> None:
+    """Region of each place, and 1 if it lies inside."""
+    region, inside = values
     radius, length = outline.point_contact_radius, outline.point_contact_length
     li = outline.li_thickness + _TOLERANCE
     for i in range(len(r)):

@@ -93,10 +93,8 @@ def _steps(
     """Fractions of the steps along the first axis that lie outside the contacts."""
     contact = region <= LI_CONTACT
     crossing = contact[:-1] != contact[1:]
-    # ends (low and high) and coordinates (r and z) of the steps that cross a surface
-    low, high = (
-        np.stack([x[ends][crossing] for x in (rr, zz)]) for ends in (np.s_[:-1], np.s_[1:])
-    )
+    nodes = np.stack([rr, zz])
+    low, high = nodes[:, :-1][:, crossing], nodes[:, 1:][:, crossing]
     # start at the node outside the contact
     start, end = np.where(contact[:-1][crossing], [high, low], [low, high])
     outside, inside = np.zeros(crossing.sum()), np.ones(crossing.sum())
