@@ -239,7 +239,13 @@ def drift_maps(
         # nodes at the corners of the cells of the ditch
         ditch = ~_all_corners(~np.pad(np.kron(_all_corners(ditch), fine), 1))
         usable = np.kron(usable, fine)
-    coefficients, per_field = velocity_table(temperature_K, settings.velocity_factors)
+    coefficients, per_field = velocity_table(
+        temperature_K,
+        (
+            (settings.electron_velocity_low_factor, settings.electron_velocity_high_factor),
+            (settings.hole_velocity_low_factor, settings.hole_velocity_high_factor),
+        ),
+    )
     return DriftMaps(
         values=np.ascontiguousarray(values),
         usable=usable,

@@ -138,7 +138,7 @@ def detector_values(
         if any(numbers):
             values[field] = next(filter(None, numbers))
     boule, cut = values["name"][:-1], values["name"][-1:]  # V99000 and A of V99000A
-    slice_name = str(_value_at(diode, "production.slice", source) or cut)
+    slice_name = str((diode.get("production") or {}).get("slice") or cut)
     folder = Path(name).parent
     folders = folder.parent / "crystals", folder / "crystals", folder
     places = [
@@ -154,15 +154,6 @@ def detector_values(
     elif isinstance(length, int | float):  # else refused with the rest of the geometry
         values |= impurity_values(content, str(crystal), slice_name, length)
     return values, reasons
-
-
-def _value_at(values: Any, place: str, source: str) -> Any:
-    """Value at a location such as ``"production.slice"``, None if there is none."""
-    for key in place.split("."):
-        if not isinstance(values, Mapping | None):
-            raise CpunetError(f"{source}: {place}: {values!r} stands before {key}; {_ANOTHER}")
-        values = values.get(key) if values else None
-    return values
 
 
 def impurity_values(
@@ -244,11 +235,13 @@ def _number_at(
     values: Mapping[str, Any], place: str, source: str, default: float | None = None
 ) -> float:
     """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
-    stored = _value_at(values, place, source)
-    value = default if stored is None else stored
-    if value is None:
+    value: Any = values
+    for key in place.split("."):
+        if not isinstance(value, Mapping | None):
+            raise CpunetError(f"{source}: {place}: {value!r} stands before {key}; {_ANOTHER}")
+        value = value.get(key) if value else None
+    if (value := default if value is None else value) is None:
         raise CpunetError(f"{source}: no {place}; {_ANOTHER}")
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not math.isfinite(value):
+    if type(value) not in (int, float) or not math.isfinite(value):
         raise CpunetError(f"{source}: {place} = {value!r} is no number; {_ANOTHER}")
     return float(value)

@@ -313,12 +313,9 @@ def _half_rings(grid: Grid) -> tuple[FloatArray, FloatArray]:
 
 def _germanium_in_cells(detector: Detector, grid: Grid) -> FloatArray:
     """Fraction (nr-1, nz-1) of each cell between four nodes that lies outside the ditch."""
-
-    def covered(edges: FloatArray, low: float, high: float) -> FloatArray:
-        overlap = np.minimum(edges[1:], high) - np.maximum(edges[:-1], low)
-        return np.asarray(np.maximum(overlap, 0) / grid.step_mm)
-
     inner, outer, depth = detector.ditch_walls
-    in_r = covered(grid.r_mm, inner, outer)
-    in_z = covered(grid.z_mm, 0.0, depth)
+    in_r, in_z = (
+        np.maximum(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0) / grid.step_mm
+        for edges, low, high in ((grid.r_mm, inner, outer), (grid.z_mm, 0.0, depth))
+    )
     return np.asarray(1 - in_r[:, np.newaxis] * in_z)

@@ -164,8 +164,7 @@ def record(event: Event, x: float, y: float, z: float, energy: float) -> None:
     """Append a deposit (mm, MeV)."""
     n = event.counts[HITS]
     if energy > 0.0 and n < len(event.hits):
-        row = event.hits[n]
-        row[0], row[1], row[2], row[3] = x, y, z, energy
+        event.hits[n, :] = (x, y, z, energy)
         event.counts[HITS] = n + 1
     elif energy > 0.0:
         event.counts[LOST] += 1
@@ -180,10 +179,7 @@ def put_photon(
     if n == len(event.photons):
         event.counts[LOST] += 1
         return
-    row = event.photons[n]
-    row[0], row[1], row[2] = x, y, z
-    row[3], row[4], row[5] = direction.x, direction.y, direction.z
-    row[6] = energy
+    event.photons[n, :] = (x, y, z, direction.x, direction.y, direction.z, energy)
     event.counts[PHOTONS] = n + 1
 
 
