@@ -160,21 +160,13 @@ def test_any_bias_and_impurity_from_one_solution(
     assert not caplog.messages
 
 
-def test_the_scale_decides_whether_a_bias_depletes(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_scale_may_deplete_impurities_that_no_bias_depletes() -> None:
     plain = read_detector("ppc", COARSE)
     many = {"impurity_z0_1e10_per_cm3": -32.0, "impurity_gradient_1e10_per_cm4": 3.2}
-    # 40 times the impurities, which no bias depletes, and a scale that undoes it
     same_sum = plain.model_copy(update=many | {"impurity_scale": 1 / 40})
+    assert solve(same_sum).unit_depletion_V == np.inf
     expected = compute_fields(plain).depletion_V
     assert compute_fields(same_sum).depletion_V == pytest.approx(expected, abs=1)
-    with pytest.raises(CpunetError, match="give at least the depletion voltage, 18"):
-        compute_fields(same_sum.model_copy(update={"bias_V": 500.0}))
-    with pytest.raises(CpunetError, match="no bias up to 20000 V depletes it"):
-        compute_fields(plain.model_copy(update={"impurity_scale": 40.0}))
-    # the solution is kept although no bias depletes its impurities as given
-    caplog.set_level("DEBUG", "cpunet")
-    assert solve(same_sum).unit_depletion_V == np.inf
-    assert not caplog.messages
 
 
 @pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)
@@ -188,12 +180,6 @@ def test_impurities_are_scaled_to_the_measured_depletion(
     # the bias is what the depletion was measured at: just depleted
     fields = compute_fields(scaled)
     assert fields.depletion_V == pytest.approx(measured, abs=1)
-    # and a solution of these impurities alone says so too
-    values = detector.model_dump()
-    for key in ("impurity_z0_1e10_per_cm3", "impurity_gradient_1e10_per_cm4"):
-        values[key] *= scaled.impurity_scale
-    alone = compute_fields(Detector.model_validate(values))
-    assert alone.depletion_V == pytest.approx(measured, abs=1)
 
 
 @pytest.mark.thorough
@@ -201,10 +187,11 @@ def test_a_detector_that_no_scale_depletes_at_the_measured_voltage() -> None:
     detector = read_detector("ppc", COARSE)
     with pytest.raises(CpunetError, match=r"no measured_depletion_V .* give"):
         scaled_to_depletion(detector)
-    values = {"measured_depletion_V": 2000.0, "surface_charge_1e10_per_cm2": -2.0}
-    with pytest.raises(CpunetError, match=r"2000 V do not deplete it even with 0.001"):
-        scaled_to_depletion(detector.model_copy(update=values))
+    charged = {"surface_charge_1e10_per_cm2": -2.0}
     pure = {"impurity_z0_1e10_per_cm3": 0.0, "impurity_gradient_1e10_per_cm4": 0.0}
-    values = {"measured_depletion_V": 2000.0, **pure}
-    with pytest.raises(CpunetError, match=r"even with 1000 times .* correct .* impurity_z0"):
-        scaled_to_depletion(detector.model_copy(update=values))
+    for values in (charged, pure):
+        wanted = detector.model_copy(update=values | {"measured_depletion_V": 2000.0})
+        with pytest.raises(
+            CpunetError, match=r"1000 times .* none depletes at 2000 V; correct"
+        ):
+            scaled_to_depletion(wanted)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import logging
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -192,10 +193,7 @@ def test_wrong_crystals_name_the_field(
 ) -> None:
     crystal = copy.deepcopy(CRYSTAL)
     *folders, last = place.split(".")
-    node = crystal
-    for key in folders:
-        node = node[key]
-    node[last] = value
+    reduce(dict.__getitem__, folders, crystal)[last] = value
     path = metadata(tmp_path, crystal, DIODE)
     file = f"{tmp_path / 'crystals' / 'B99000.yaml'}: "
     read = lambda: read_detector(path, ["temperature_K=90"])  # noqa: E731
@@ -319,14 +317,11 @@ def test_radial_terms_need_a_power(tmp_path: Path) -> None:
     assert found == pytest.approx([-1, -1.5 - 0.4])
 
 
-def test_what_was_cut_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_was_cut_is_said_and_holes_off_the_axis_are_refused(tmp_path, caplog) -> None:
     with caplog.at_level(logging.INFO, "cpunet"):
         siggen(tmp_path, "pc_radius 14")
     (said,) = caplog.messages
     assert "pc_radius is 12 mm, as in siggen: at most wrap_around_radius - ditch_th" in said
-
-
-def test_holes_beside_the_axis_are_refused(tmp_path: Path) -> None:
     with pytest.raises(CpunetError, match="hole_offset_y_top is not 0; only axially symmetric"):
         siggen(tmp_path, "hole_offset_y_top 4")
 

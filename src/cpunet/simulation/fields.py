@@ -305,16 +305,11 @@ def scaled_to_depletion(detector: Detector) -> Detector:
         middle = math.sqrt(low * high)
         pocket = has_pocket(solution.total_V(measured, middle, tilt), solution.grid.region)
         low, high = (low, middle) if pocket else (middle, high)
-    what = f"detector {detector.name}: {measured:g} V"
-    if low == 1 / _LARGEST_SCALE:
+    if low == 1 / _LARGEST_SCALE or high == _LARGEST_SCALE:
         raise CpunetError(
-            f"{what} do not deplete it even with {low:g} of its impurities; correct "
+            f"detector {detector.name}: between {1 / _LARGEST_SCALE:g} and {_LARGEST_SCALE:g} "
+            f"times its impurities none depletes at {measured:g} V; correct "
             "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
-        )
-    if high == _LARGEST_SCALE:
-        raise CpunetError(
-            f"{what} deplete it even with {high:g} times its impurities; correct "
-            "measured_depletion_V or impurity_z0_1e10_per_cm3"
         )
     log.info(
         f"{detector.name}: impurities times {low:.4g}, so that it depletes at the measured "
