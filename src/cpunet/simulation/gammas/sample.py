@@ -362,34 +362,34 @@ def emit(
 
 
 @kernel(error_model="numpy")
-def simulate_block(
+def simulate_events(
     medium: Medium,
     source: tuple[float, float, float, float],
     n_primaries: int,
     windows: Array,
     missing: Integers,
     rng: np.random.Generator,
-    hits: Array,
-    offsets: Integers,
-    primaries: Integers,
-) -> tuple[int, int, int]:
-    """Simulate until the primaries, the space for hits or the missing events run out.
+) -> tuple[Array, Integers, int, int]:
+    """Simulate until the primaries or the missing events run out.
 
     An event counts if it lies in one of the `windows` (low and high in MeV) of which events
-    are still `missing`, or always if there are no windows. Returns the numbers of primaries
-    done, of events chosen, and of events left out because they have more than `MAX_HITS`
-    deposits.
+    are still `missing`, or always if there are no windows. Returns the deposits, the primary
+    and the end of each event, and the numbers of primaries, and of events left out because they
+    have more than `MAX_HITS` deposits.
     """
     photons, counts = np.empty((MAX_PHOTONS, 7)), np.zeros(3, np.int64)
-    n_kept = n_left_out = 0
-    offsets[0] = 0
+    hits, events = np.empty((2 * MAX_HITS, 4)), np.empty((64, 2), np.int64)  # they grow
+    end = n_events = n_left_out = 0
     for primary in range(n_primaries):
-        start = offsets[n_kept]
-        full = len(hits) - start < MAX_HITS or n_kept == len(primaries)
-        if full or (len(missing) > 0 and missing.sum() == 0):
-            return primary, n_kept, n_left_out
+        if len(missing) > 0 and missing.sum() == 0:
+            n_primaries = primary
+            break
+        if len(hits) - end < MAX_HITS:
+            hits = np.concatenate((hits, np.empty_like(hits)))
+        if n_events == len(events):
+            events = np.concatenate((events, np.empty_like(events)))
         counts[:] = 0
-        event = Event(hits[start : start + MAX_HITS], photons, counts)
+        event = Event(hits[end : end + MAX_HITS], photons, counts)
         emit(medium.outline, source, event, rng)
         follow_photons(medium, event, rng)
         if counts[LOST] > 0:
@@ -407,17 +407,14 @@ def simulate_block(
                 keep = True
                 break
         if keep:
-            primaries[n_kept] = primary
-            n_kept += 1
-            offsets[n_kept] = start + counts[HITS]
-    return n_primaries, n_kept, n_left_out
+            end += counts[HITS]
+            events[n_events, :] = (primary, end)
+            n_events += 1
+    return hits[:end], events[:n_events], n_primaries, n_left_out
 
 
 TL208_KEV = 2614.511
 """Energy of the gamma line of Tl-208 in keV."""
-
-_BLOCK_HITS = 1_000_000
-_BLOCK_EVENTS = 20_000
 
 
 class EnergyWindow(NamedTuple):
@@ -494,24 +491,13 @@ def simulate_gammas(
     edges = [(line.low_kev / 1e3 - 1e-9, line.high_kev / 1e3 + 1e-9) for line in wanted]
     windows, missing = np.array(edges).reshape(-1, 2), np.array([*wanted.values()], np.int64)
     rng = np.random.default_rng(seed)
-    hits = np.empty((min(_BLOCK_HITS, MAX_HITS + 300 * n_primaries), 4))
-    offsets = np.zeros(_BLOCK_EVENTS + 1, np.int64)
-    primaries = np.empty(_BLOCK_EVENTS, np.int64)
-    blocks: list[Hits] = [Hits.of([], [], [0])]
-    done = left_out = 0
-    while done < n_primaries and not (wanted and missing.sum() == 0):
-        tried, n_chosen, large = simulate_block(
-            medium, source, n_primaries - done, windows, missing, rng, hits, offsets, primaries
-        )
-        ends = offsets[: n_chosen + 1].copy()
-        deposits = hits[: ends[-1]]
-        blocks.append(
-            Hits.of(deposits[:, :3], deposits[:, 3] * 1e3, ends, primaries[:n_chosen] + done)
-        )
-        done, left_out = done + tried, left_out + large
+    deposits, events, done, left_out = simulate_events(
+        medium, source, n_primaries, windows, missing, rng
+    )
     if left_out:
         log.warning(f"{left_out} events have more than {MAX_HITS} deposits and are left out")
     if missing.any():
         short = ", ".join(f"{n} of {w.name}" for w, n in zip(wanted, missing, strict=True) if n)
         raise CpunetError(f"{n_primaries} gammas were not enough: {short} missing; allow more")
-    return Hits.concatenate(blocks), done
+    offsets = np.append(0, events[:, 1])
+    return Hits.of(deposits[:, :3], deposits[:, 3] * 1e3, offsets, events[:, 0]), done
