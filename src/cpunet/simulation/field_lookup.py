@@ -234,7 +234,18 @@ def drift_maps(
     if parts > 1:
         for _ in range(_SPLINE_GHOSTS):
             values, filled = with_ghost_nodes(values, filled)
-        values = _refined(values, parts, mirror=not stacked[:, 0, E_Z].any())
+        # The axis is a mirror, as is z = 0 without a field across it: such fields are odd.
+        n = _SPLINE_MIRROR
+        odd_r, odd_z = np.ones(4), np.ones(4)
+        odd_r[E_R] = odd_z[E_Z] = -1
+        values = np.concatenate([values[n:0:-1] * odd_r, values])
+        below = 0 if stacked[:, 0, E_Z].any() else n
+        if below:
+            values = np.concatenate([values[:, n:0:-1] * odd_z, values], axis=1)
+        r, z = np.arange(values.shape[0]) - n, np.arange(values.shape[1]) - below
+        fine_r, fine_z = (np.arange(nodes[-1] * parts + 1) / parts for nodes in (r, z))
+        splines = [RectBivariateSpline(r, z, values[..., k], s=0) for k in range(4)]
+        values = np.stack([spline(fine_r, fine_z) for spline in splines], axis=-1)
         fine = np.ones((parts, parts), np.bool_)
         # nodes at the corners of the cells of the ditch
         ditch = ~_all_corners(~np.pad(np.kron(_all_corners(ditch), fine), 1))
@@ -261,25 +272,6 @@ def drift_maps(
 def _all_corners(nodes: BoolArray) -> BoolArray:
     """Cells (nr - 1, nz - 1) with all four corners in `nodes` (nr, nz)."""
     return np.asarray(nodes[:-1, :-1] & nodes[1:, :-1] & nodes[:-1, 1:] & nodes[1:, 1:])
-
-
-def _refined(values: FloatArray, parts: int, *, mirror: bool) -> FloatArray:
-    """Values (nr, nz, 4) on a grid `parts` times finer, by bicubic splines.
-
-    The axis is a mirror, as is z = 0 if `mirror`: the field across it is odd.
-    """
-    n = _SPLINE_MIRROR
-    odd_r, odd_z = np.ones(4), np.ones(4)
-    odd_r[E_R] = odd_z[E_Z] = -1
-    values = np.concatenate([values[n:0:-1] * odd_r, values])
-    below = n if mirror else 0
-    if mirror:
-        values = np.concatenate([values[:, n:0:-1] * odd_z, values], axis=1)
-    r, z = np.arange(values.shape[0]) - n, np.arange(values.shape[1]) - below
-    fine_r = np.arange(r[-1] * parts + 1) / parts
-    fine_z = np.arange(z[-1] * parts + 1) / parts
-    splines = [RectBivariateSpline(r, z, values[..., k], s=0) for k in range(4)]
-    return np.stack([spline(fine_r, fine_z) for spline in splines], axis=-1)
 
 
 def with_ghost_nodes(values: FloatArray, given: BoolArray) -> tuple[FloatArray, BoolArray]:

@@ -109,13 +109,6 @@ def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
 SOLVER_VERSION = 4
 
 
-def cache_file(detector: Detector) -> Path:
-    """Cache file of the potentials of a detector, at any bias and scale of its impurities."""
-    folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
-    key = detector.fingerprint(exclude=("name", *_NOT_IN_PARTS))
-    return Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
-
-
 # fields that do not affect the parts of the potential, and values in their place
 _NOT_IN_PARTS = {
     "temperature_K": 90.0,
@@ -185,7 +178,10 @@ def solve(detector: Detector) -> Superposition:
     CpunetError
         If the grid is too fine.
     """
-    return solved(detector.model_copy(update=_NOT_IN_PARTS), cache_file(detector))
+    folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
+    key = detector.fingerprint(exclude=("name", *_NOT_IN_PARTS))
+    file = Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
+    return solved(detector.model_copy(update=_NOT_IN_PARTS), file)
 
 
 @functools.lru_cache(_MAX_SHAPES)

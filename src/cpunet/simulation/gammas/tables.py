@@ -109,7 +109,15 @@ def electron_table() -> ElectronTable:
     most = np.minimum(middle, PHOTON_CUT)
     soft = _radiation(middle[:, np.newaxis], (np.arange(32) + 0.5) / 32 * most[:, np.newaxis])
     step = energy * _LOSS_PER_STEP / (_collision_loss(middle) + soft.mean(axis=1) * most)
-    hard, quantiles = zip(*map(_hard_photons, middle), strict=True)
+    # photons above the cut: number per mm, and quantiles of their energy fraction k/T
+    hard, quantiles = np.zeros(rows), np.ones((rows, _BREMS_NODES))
+    for i in np.flatnonzero(middle > PHOTON_CUT):
+        log = np.linspace(np.log(PHOTON_CUT), np.log(middle[i]), 256)
+        density = _radiation(middle[i], np.exp(log))
+        cumulative = np.append(0.0, np.cumsum((density[1:] + density[:-1]) / 2))
+        wanted = np.linspace(0, cumulative[-1], _BREMS_NODES)
+        quantiles[i] = np.exp(np.interp(wanted, cumulative, log)) / middle[i]
+        hard[i] = np.trapezoid(density, log)
     # inverse of the first transport mean free path: -d<cos>/ds at s = 0
     momentum = np.sqrt(middle * (middle + 2 * ELECTRON_MASS))
     beta = momentum / (middle + ELECTRON_MASS)
@@ -132,9 +140,9 @@ def electron_table() -> ElectronTable:
         step=step,
         scattering=scale,
         scattering_cut=1 - np.exp(-2 / scale),
-        brems=1 - np.exp(-step * np.array(hard)),
+        brems=1 - np.exp(-step * hard),
         annihilation=1 - np.exp(-step * annihilation),
-        photon_share=np.stack(quantiles),
+        photon_share=quantiles,
     )
 
 
@@ -162,15 +170,3 @@ def _radiation(kinetic: float | Array, photon: Array) -> Array:
     logarithm = np.minimum(unscreened, np.log(183 * _Z ** (-1 / 3)))
     scale = 4 * _ALPHA * _RADIUS**2 * _Z * (_Z + 1) * _ATOMS / 10
     return np.asarray(scale * (1 + ratio**2 - 2 / 3 * ratio) * logarithm)
-
-
-def _hard_photons(kinetic: float) -> tuple[float, Array]:
-    """Photons above the cut: number per mm, and quantiles of their energy fraction k/T."""
-    if kinetic <= PHOTON_CUT:
-        return 0.0, np.ones(_BREMS_NODES)
-    log = np.linspace(np.log(PHOTON_CUT), np.log(kinetic), 256)
-    density = _radiation(kinetic, np.exp(log))
-    cumulative = np.append(0.0, np.cumsum((density[1:] + density[:-1]) / 2))
-    wanted = np.linspace(0, cumulative[-1], _BREMS_NODES)
-    quantiles = np.exp(np.interp(wanted, cumulative, log)) / kinetic
-    return float(np.trapezoid(density, log)), quantiles
