@@ -95,9 +95,9 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     for number, (of, _, _) in enumerate(_REGIONS):
         cover[region == of] = number
     cover[~inside] = len(_REGIONS)
-    colours = ListedColormap([*(colour for _, _, colour in _REGIONS), "white"])
+    covers = ListedColormap([*(colour for _, _, colour in _REGIONS), "white"])
     for axes in panels:
-        axes.pcolormesh(at_r, at_z, cover, cmap=colours, zorder=2.2, rasterized=True)
+        axes.pcolormesh(at_r, at_z, cover, cmap=covers, zorder=2.2, rasterized=True)
         axes.contour(
             at_r, at_z, inside.astype(float), [0.5], colors="black", linewidths=1.0, zorder=2.3
         )

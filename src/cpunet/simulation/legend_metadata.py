@@ -149,7 +149,7 @@ def detector_values(
     length = values.get("crystal_length")
     if content.get("impurity_curve") is None:
         reasons["impurity_z0_1e10_per_cm3"] = (
-            f"{crystal} has no impurity_curve" if crystal else f"there is no {places[0]}"
+            f"{crystal} has no impurity_curve" if crystal else f"there is no {files[0]}"
         )
     elif isinstance(length, int | float):  # else refused with the rest of the geometry
         values |= impurity_values(content, str(crystal), slice_name, length)
