@@ -141,11 +141,10 @@ def detector_values(
     slice_name = str((diode.get("production") or {}).get("slice") or cut)
     folder = Path(name).parent
     folders = folder.parent / "crystals", folder / "crystals", folder
-    places = [
-        place / f"{boule}{end}" for place in folders for end in (".yaml", ".yml", ".json")
-    ]
-    crystal = next(filter(Path.is_file, places), None)
-    content = read_values(crystal) if crystal else {}
+    ends = (".yaml", ".yml", ".json")
+    files = [place / f"{boule}{end}" for place in folders for end in ends]
+    crystal = next(filter(Path.is_file, files), None)
+    content: dict[str, Any] = read_values(crystal) if crystal else {}
     length = values.get("crystal_length")
     if content.get("impurity_curve") is None:
         reasons["impurity_z0_1e10_per_cm3"] = (
