@@ -161,40 +161,26 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     True
     """
     r_flux, z_flux, to_ground = conductances(detector, grid)
-    free = grid.free
-
-    def from_neighbours(values: FloatArray) -> FloatArray:
-        flux = np.zeros(free.shape)
-        flux[:-1] += r_flux * values[1:]
-        flux[1:] += r_flux * values[:-1]
-        flux[:, :-1] += z_flux * values[:, 1:]
-        flux[:, 1:] += z_flux * values[:, :-1]
-        return flux
-
-    number = np.full(free.shape, -1)
-    number[free] = np.arange(free.sum())
-    diagonal = from_neighbours(np.ones(free.shape))
+    free, n_z = grid.free, len(grid.z_mm)
+    # conductances to the neighbours outwards, inwards, above and below
+    outwards, inwards = np.pad(r_flux, ((0, 1), (0, 0))), np.pad(r_flux, ((1, 0), (0, 0)))
+    above, below = np.pad(z_flux, ((0, 0), (0, 1))), np.pad(z_flux, ((0, 0), (1, 0)))
+    diagonal = outwards + inwards + above + below
     diagonal[:, 0] += to_ground
-    rows, columns, values = [number[free]], [number[free]], [diagonal[free]]
-    for flux, low, high in (
-        (r_flux, number[:-1], number[1:]),
-        (z_flux, number[:, :-1], number[:, 1:]),
-    ):
-        both = (low >= 0) & (high >= 0)
-        rows += [low[both], high[both]]
-        columns += [high[both], low[both]]
-        values += [-flux[both], -flux[both]]
-    matrix = sp.csc_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    )
+    bands = [outwards.ravel()[:-n_z], above.ravel()[:-1]]
+    neighbours = sp.diags_array(2 * bands, offsets=(n_z, 1, -n_z, -1)).tocsr()
+    matrix = (sp.diags_array(diagonal.ravel()) - neighbours)[free.ravel()][:, free.ravel()]
     # symmetric and diagonally dominant: no pivoting, and an ordering that exploits it
     options = {"SymmetricMode": True}
-    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    factors = splu(
+        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+    )
 
     def solved(boundary: FloatArray, charge: FloatArray) -> FloatArray:
         # potentials of contacts are given: their columns are moved to the right-hand side
         potential = boundary.copy()
-        potential[free] = factors.solve((charge + from_neighbours(boundary))[free])
+        given = (neighbours @ boundary.ravel()).reshape(free.shape)
+        potential[free] = factors.solve((charge + given)[free])
         return potential
 
     nothing = np.zeros(free.shape)
