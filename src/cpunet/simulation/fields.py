@@ -36,7 +36,7 @@ from cpunet.progress import stage
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
 from cpunet.simulation.outline import DITCH, GERMANIUM, LI_CONTACT
-from cpunet.simulation.poisson import Grid, Potentials, make_grid, solve_potentials
+from cpunet.simulation.poisson import Grid, Potentials, make_grid, on_nodes, solve_potentials
 
 log = logging.getLogger(__name__)
 
@@ -356,11 +356,10 @@ def electric_field(
         ditch = region == DITCH
         rise = np.diff(volts, axis=0) / (steps * grid.step_mm)
         weight = np.where(ditch[:-1] & ditch[1:], 1e-9, 1.0) / (steps * grid.step_mm)
-        slope, total = np.zeros_like(volts), np.zeros_like(volts)
-        for nodes in (slice(None, -1), slice(1, None)):
-            slope[nodes] += weight * rise
-            total[nodes] += weight
-        components.append(-_V_PER_CM * (slope / total))
+        slope = on_nodes(weight * rise, weight * rise, axis=0) / on_nodes(
+            weight, weight, axis=0
+        )
+        components.append(-_V_PER_CM * slope)
     e_r, e_z = components[0], components[1].T
     e_r[0] = 0
     if mirror:

@@ -162,12 +162,10 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     """
     r_flux, z_flux, to_ground = conductances(detector, grid)
     free, n_z = grid.free, len(grid.z_mm)
-    # conductances to the neighbours outwards, inwards, above and below
-    outwards, inwards = np.pad(r_flux, ((0, 1), (0, 0))), np.pad(r_flux, ((1, 0), (0, 0)))
     above, below = np.pad(z_flux, ((0, 0), (0, 1))), np.pad(z_flux, ((0, 0), (1, 0)))
-    diagonal = outwards + inwards + above + below
+    diagonal = on_nodes(r_flux, r_flux, axis=0) + above + below
     diagonal[:, 0] += to_ground
-    bands = [outwards.ravel()[:-n_z], above.ravel()[:-1]]
+    bands = [r_flux.ravel(), above.ravel()[:-1]]
     neighbours = sp.diags_array(2 * bands, offsets=(n_z, 1, -n_z, -1)).tocsr()
     matrix = (sp.diags_array(diagonal.ravel()) - neighbours)[free.ravel()][:, free.ravel()]
     # symmetric and diagonally dominant: no pivoting, and an ordering that exploits it
@@ -213,18 +211,13 @@ def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray
     h = grid.step_mm
     epsilon = 1 + (EPSILON_GERMANIUM - 1) * _germanium_in_cells(detector, grid)
     # a step in r crosses the upper half of the cell below it and the lower of the one above
-    between = np.zeros((epsilon.shape[0], epsilon.shape[1] + 1))
-    between[:, 1:] += epsilon / 2
-    between[:, :-1] += epsilon / 2
+    between = on_nodes(epsilon / 2, epsilon / 2, axis=1)
     middle = (grid.r_mm[:-1] + grid.r_mm[1:]) / 2
     r_flux = between * middle[:, np.newaxis] / grid.r_steps
     inner, outer = _half_rings(grid)
-    z_flux = np.zeros((len(grid.r_mm), epsilon.shape[1]))
-    z_flux[1:] += epsilon * inner[1:, np.newaxis] / h
-    z_flux[:-1] += epsilon * outer[:-1, np.newaxis] / h
-    z_flux /= grid.z_steps
+    z_flux = on_nodes(epsilon * inner[1:] / h, epsilon * outer[:-1] / h, axis=0) / grid.z_steps
     gap = detector.vacuum_gap
-    to_ground = (inner + outer) / gap if gap else np.zeros(len(grid.r_mm))
+    to_ground = (inner + outer)[:, 0] / gap if gap else np.zeros(len(grid.r_mm))
     return r_flux, z_flux, to_ground
 
 
@@ -245,13 +238,9 @@ def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
         # in fieldgen the ditch has 1/16 of the charge density of germanium
         germanium = germanium + (1 - germanium) / EPSILON_GERMANIUM
     inner, outer = _half_rings(grid)
-    by_column = np.zeros((len(grid.r_mm), germanium.shape[1]))
-    by_column[1:] += germanium * inner[1:, np.newaxis] * grid.step_mm / 2
-    by_column[:-1] += germanium * outer[:-1, np.newaxis] * grid.step_mm / 2
-    volume = np.zeros(grid.region.shape)
-    volume[:, 1:] += by_column
-    volume[:, :-1] += by_column
-    return np.asarray(VOLT_PER_MM2 * impurity * volume)
+    h = grid.step_mm
+    half = on_nodes(germanium * inner[1:] * h / 2, germanium * outer[:-1] * h / 2, axis=0)
+    return np.asarray(VOLT_PER_MM2 * impurity * on_nodes(half, half, axis=1))
 
 
 def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
@@ -268,7 +257,7 @@ def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
     inner, outer = _half_rings(grid)
     face = np.zeros(grid.region.shape)
     if detector.siggen_conventions:
-        face[:, 0] = (inner + outer) * (grid.region[:, 0] == GERMANIUM)
+        face[:, 0] = (inner + outer)[:, 0] * (grid.region[:, 0] == GERMANIUM)
         if not face.any():
             raise CpunetError(
                 f"detector {detector.name}: the ditch leaves no germanium on z = 0 for "
@@ -277,11 +266,9 @@ def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
             )
     else:
         germanium = _germanium_in_cells(detector, grid)
-        face[1:, 0] += germanium[:, 0] * inner[1:]
-        face[:-1, 0] += germanium[:, 0] * outer[:-1]
-        floor = np.abs(np.diff(germanium, axis=1))
-        face[1:, 1:-1] += floor * inner[1:, np.newaxis]
-        face[:-1, 1:-1] += floor * outer[:-1, np.newaxis]
+        # below z = 0 and in the ditch is no germanium
+        floor = np.abs(np.diff(germanium, axis=1, prepend=0))
+        face[:, :-1] = on_nodes(floor * inner[1:], floor * outer[:-1], axis=0)
         half_wall = np.abs(np.diff(germanium, axis=0)) * grid.step_mm / 2
         half_wall *= grid.r_mm[1:-1, np.newaxis]
         face[1:-1, 1:] += half_wall
@@ -290,9 +277,16 @@ def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
     return np.asarray(10 * VOLT_PER_MM2 * detector.surface_charge_1e10_per_cm2 * face)
 
 
+def on_nodes(above: FloatArray, below: FloatArray, axis: int) -> FloatArray:
+    """Sums at the nodes between cells along an axis: of the cell before, and of that after."""
+    before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
+    before[axis], after[axis] = (1, 0), (0, 1)
+    return np.asarray(np.pad(above, before) + np.pad(below, after))
+
+
 def _half_rings(grid: Grid) -> tuple[FloatArray, FloatArray]:
-    """Area per unit angle, in mm2, of each node's half ring towards the axis and away."""
-    r, h = grid.r_mm, grid.step_mm
+    """Area (nr, 1) per unit angle, in mm2, of each half ring towards the axis and away."""
+    r, h = grid.r_mm[:, np.newaxis], grid.step_mm
     inner = np.where(r > 0, (r**2 - (r - h / 2) ** 2) / 2, 0)
     return inner, ((r + h / 2) ** 2 - r**2) / 2
 
