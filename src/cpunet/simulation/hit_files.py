@@ -484,11 +484,14 @@ def _has(item: Any, *parts: str) -> bool:
 def _npz_table(path: Path) -> StepTable:
     """Arrays with a value per hit. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
     arrays = read_arrays(path)
+    needed = [*_ARRAYS, "offsets"]
+    if missing := [name for name in needed if name not in arrays]:
+        raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(needed)}")
     offsets = whole_numbers(arrays["offsets"], f"{path}: offsets")
     counts = np.diff(offsets)
     if offsets[:1].any() or np.any(counts < 0):
         raise CpunetError(f"{path}: offsets do not divide the hits into events")
-    columns = {column: arrays[name] for name, column in _ARRAYS.items() if name in arrays}
+    columns = {column: arrays[name] for name, column in _ARRAYS.items()}
     return StepTable(path, columns | {"event": np.repeat(np.arange(len(counts)), counts)})
 
 
