@@ -88,7 +88,7 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     # contacts and lithium layer filled, the outside and the ditch blank
     step = max(detector.crystal_length, detector.crystal_radius) / _OUTLINE_POINTS
     at_r = np.arange(0, 1.05 * detector.crystal_radius, step)
-    at_z = np.arange(0, 1.05 * detector.crystal_length, step)
+    at_z = np.arange(-step, 1.05 * detector.crystal_length, step)  # the face has an outside
     rr, zz = np.meshgrid(at_r, at_z)
     inside, region = detector.inside(rr, zz), detector.region(rr, zz)
     cover = np.full(rr.shape, np.nan)
@@ -101,9 +101,6 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
         axes.contour(
             at_r, at_z, inside.astype(float), [0.5], colors="black", linewidths=1.0, zorder=2.3
         )
-        # contours do not run along the edge of the axes
-        bottom = np.where(inside[0], 0.0, np.nan)
-        axes.plot(at_r, bottom, color="black", linewidth=1.0, zorder=2.3)
         axes.set(xlabel="r [mm]", aspect="equal")
         axes.grid(visible=False)
         axes.set_xlim(0, detector.crystal_radius * 1.02)

@@ -250,6 +250,3 @@ class GammaSource:
                 primaries += n_primaries
         finally:
             pool.shutdown(cancel_futures=True)
-
-
-HitSource = HitFile | GammaSource

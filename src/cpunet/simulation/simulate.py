@@ -26,7 +26,6 @@ from cpunet.simulation.hit_files import HIT_TABLE, hit_columns, read_hits
 from cpunet.simulation.hit_sources import (
     GammaSource,
     HitFile,
-    HitSource,
     energy_windows,
     wanted_events,
 )
@@ -177,7 +176,7 @@ def simulate(
     crystal, physics = detector_and_settings(detector, settings)
     peaks = load_recipe("fast").peaks
     windows = energy_windows(",".join(peaks), peaks, physics.window_kev)
-    source: HitSource
+    source: HitFile | GammaSource
     if hits is not None:
         source = hits if isinstance(hits, HitFile) else HitFile(Path(hits), frame)
         if events is not None:
