@@ -55,9 +55,9 @@ def write_steps(path: Path, pool: Hits, n_events: int, block: int = 20_000) -> i
     path.unlink(missing_ok=True)
     n_steps = 0
     for first in range(0, n_events, block):
-        hits = pool[np.arange(first, min(first + block, n_events)) % pool.n_events]
+        hits = pool[np.arange(first, min(first + block, n_events)) % len(pool)]
         n_steps += len(hits.edep_kev)
-        table = Table({"evtid": Array(np.arange(first, first + hits.n_events))})
+        table = Table({"evtid": Array(np.arange(first, first + len(hits)))})
         columns = {"xloc": hits.x_mm, "yloc": hits.y_mm, "zloc": hits.z_mm}
         for name, values in [*columns.items(), ("edep", hits.edep_kev)]:
             in_unit = (values, "keV") if name == "edep" else (1e-3 * values, "m")

@@ -54,9 +54,9 @@ def main() -> None:
     sites = cluster_hits(hits, 1.5)
     spent = time.process_time() - start
     print(
-        f"{hits.n_events / spent:,.0f} events/s merged, "
-        f"{len(hits.edep_kev) / hits.n_events:.0f} hits to "
-        f"{len(sites.edep_kev) / hits.n_events:.2f} sites per event"
+        f"{len(hits) / spent:,.0f} events/s merged, "
+        f"{len(hits.edep_kev) / len(hits):.0f} hits to "
+        f"{len(sites.edep_kev) / len(hits):.2f} sites per event"
     )
     for height_mm, expected in GEANT4.items():
         compare(height_mm, expected)

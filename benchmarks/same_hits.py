@@ -18,7 +18,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import Shift, SimulationSettings
-from cpunet.simulation.simulate import SameHits
+from cpunet.simulation.simulator import Simulator
 
 EVENTS = 500
 SHIFTS = (
@@ -55,15 +55,14 @@ def main() -> None:
     settings = SimulationSettings(dt_ns=4, length_ns=2400)
     source = GammaSource({EnergyWindow("FEP", 2614.0, 2615.0): EVENTS}, 20.0, 5.0, 1)
     hits = merge_hits(Hits.concatenate(list(source.open(detector).blocks)), detector, 0.05)
-    same = SameHits(hits)
     first = {}
     # the same events everywhere: those that lose less than 1 keV in the lithium layer
-    kept = same.simulate(detector, settings).lost_kev < 1
+    kept = Simulator(detector, settings).events(hits).lost_kev < 1
     for mode in ("exact", "quick"):
-        events = same.simulate(detector, settings, quick=mode == "quick")
+        events = Simulator(detector, settings, quick=mode == "quick").events(hits)
         first[mode] = moments(events.waveforms[kept], 4)
         start = time.process_time()
-        same.simulate(detector, SimulationSettings(), quick=mode == "quick")
+        Simulator(detector, SimulationSettings(), quick=mode == "quick").events(hits)
         spent = time.process_time() - start
         print(f"{mode}: {spent:.2f} s of CPU for {EVENTS} events at 16 ns")
     print("shift: exact change of ln I_max, rise and 90 % time; error of the quick one")
@@ -71,9 +70,8 @@ def main() -> None:
         shift = Shift(**values)
         change = []
         for mode in ("exact", "quick"):
-            events = same.simulate(
-                shift.applied(detector), shift.applied(settings), quick=mode == "quick"
-            )
+            other = shift.applied(detector), shift.applied(settings)
+            events = Simulator(*other, quick=mode == "quick").events(hits)
             change.append(moments(events.waveforms[kept], 4) - first[mode])
         exact, error = change[0], change[1] / change[0] - 1
         changes = ", ".join(

@@ -35,7 +35,7 @@ def stored_maps(folder: Path) -> FieldMaps:
             weighting_potential=maps["WP_01"],
             region=maps["point_type"],
             capacitance_pF=np.nan,
-            depletion_V=np.nan,
+            depletion=lambda: np.nan,
         )
 
 

@@ -59,7 +59,9 @@ def events_of(path: Path, detector: str) -> Hits:
     """Events above 600 keV: their hits merged, those in the lithium left out."""
     hits = read_hits(path)
     hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)], 0.05)
-    hits = hits.where(read_detector(detector).active(hits.r_mm, hits.z_mm))
+    active = read_detector(detector).active(hits.r_mm, hits.z_mm)
+    ends = np.append(0, np.cumsum(active))[hits.offsets]
+    hits = Hits.of(hits.position_mm[active], hits.edep_kev[active], ends, hits.event_number)
     return hits[np.flatnonzero(np.diff(hits.offsets) > 0)]
 
 
@@ -67,7 +69,7 @@ def drifted(folder: Path, detector: str, hits: Hits, mode: float) -> np.ndarray:
     """A/E of exactly drifted events, translated as a whole."""
     simulator, found = Simulator(read_detector(detector), SETTINGS), []
     translate = TemplateTranslator(REN.load(folder), 1.0)
-    for first in range(0, hits.n_events, 500):
+    for first in range(0, len(hits), 500):
         waveforms = simulator.events(hits[first : first + 500]).waveforms
         found.append(currents_about_peak(translate(waveforms))[0][..., PEAK] / mode)
     return np.concatenate(found)
@@ -109,7 +111,7 @@ def compare(folder: Path, detector: str, hits: Hits, path: Path) -> None:
         taken = time.monotonic() - begun
         quantiles = np.percentile(np.abs(apart), [50, 90, 99, 100])
         print(
-            f"  {hits.n_events} events, {title}: A/E apart by "
+            f"  {len(hits)} events, {title}: A/E apart by "
             + ", ".join(f"{q:.3f}" for q in quantiles)
             + f" % (50, 90, 99, 100 %); within 0.2 %: {100 * (np.abs(apart) < 0.2).mean():.2f}"
             f" %; reboost {taken:.0f} s",

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
-from cpunet.progress import stage
 from cpunet.pulses import provenance
 from cpunet.pulses.doubts import rolled_over
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_sizes
@@ -191,8 +190,7 @@ def look(
         from cpunet.simulation.fields import compute_fields, fields_in_words
 
         detector = read_detector(path, settings)
-        with stage(f"Fields of {detector.name}"):
-            fields = compute_fields(detector)
+        fields = compute_fields(detector)
 
         def draw() -> Figure:
             from cpunet.simulation.detector_figure import detector_figure

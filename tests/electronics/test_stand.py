@@ -22,7 +22,8 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import Shift, SimulationSettings
-from cpunet.simulation.simulate import SameHits, StoredSimulation
+from cpunet.simulation.simulate import StoredSimulation
+from cpunet.simulation.simulator import Simulator
 from cpunet.training.chain_fit import POOR
 from cpunet.training.train import train
 from synthetic import load_recipe, prepared_truth
@@ -165,7 +166,7 @@ def test_pulses_made_again_are_those_stored(tmp_path: Path, preset: str) -> None
     stored = StoredSimulation.read(tmp_path / "a" / "sim.lh5")
     assert stored.detector == DETECTOR
     assert stored.settings == settings.model_copy(update={"dt_ns": electronics.dt_ns})
-    again = SameHits(stored.hits).simulate(stored.detector, stored.settings).pulses()
+    again = Simulator(stored.detector, stored.settings).events(stored.hits).pulses()
     with h5py.File(tmp_path / "a" / "sim.lh5") as file:
         np.testing.assert_array_equal(again.event_number, file["geds/sim/event_number"][()])
         np.testing.assert_allclose(again.energy_kev, file["geds/sim/energy"][()], atol=1e-6)

@@ -13,7 +13,6 @@ from hypothesis import strategies as st
 from cpunet.simulation.field_lookup import (
     ELECTRON,
     HOLE,
-    VelocityTable,
     carrier_velocity,
     velocity_factor,
     velocity_table,
@@ -30,7 +29,9 @@ def drift_paths(fields: FieldMaps, *places: npt.ArrayLike) -> tuple[np.ndarray, 
     return Simulator(read_detector("icpc"), STEPS, fields=fields).paths(*places)
 
 
-def drift_velocity(table: VelocityTable, fields: npt.ArrayLike, carrier: int) -> np.ndarray:
+def drift_velocity(
+    table: tuple[np.ndarray, float], fields: npt.ArrayLike, carrier: int
+) -> np.ndarray:
     """Velocity vectors (n, 3) for field vectors (n, 3)."""
     rows = np.asarray(fields, float).tolist()
     return np.array([carrier_velocity(*table, carrier, *row)[:3] for row in rows])

@@ -9,13 +9,11 @@ import pytest
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.fields import (
-    NOT_IN_PARTS,
     FieldMaps,
-    cache_file,
     compute_fields,
     scaled_to_depletion,
     solve,
-    superposed_fields,
+    solved,
 )
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
@@ -24,13 +22,15 @@ COARSE = ["grid_mm=0.5"]
 
 
 @pytest.fixture(autouse=True)
-def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def no_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("CPUNET_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "cache"
 
 
 def same(one: FieldMaps, other: FieldMaps) -> bool:
-    return all(np.array_equal(value, getattr(other, key)) for key, value in vars(one).items())
+    names = vars(one).keys() - {"depletion"}
+    return one.depletion_V == other.depletion_V and all(
+        np.array_equal(getattr(one, name), getattr(other, name)) for name in names
+    )
 
 
 @pytest.mark.thorough
@@ -93,20 +93,22 @@ def test_solved_once(caplog: pytest.LogCaptureFixture) -> None:
     caplog.clear()
     warmer = detector.model_copy(update={"temperature_K": 100.0, "name": "warm"})
     second = compute_fields(warmer)
-    assert not caplog.messages
     np.testing.assert_array_equal(first.potential_V, second.potential_V)
+    solved.cache_clear()  # from the disk
     assert same(first, compute_fields(detector))
+    assert not caplog.messages
     thicker = detector.model_copy(update={"li_thickness": 1.1})
     compute_fields(thicker)
     assert caplog.messages
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "text", "other"])
-def test_a_damaged_cache_is_solved_anew(damage: str) -> None:
+def test_a_damaged_cache_is_solved_anew(tmp_path: Path, damage: str) -> None:
     detector = read_detector("icpc", COARSE)
     first = compute_fields(detector)
-    path = cache_file(detector.fingerprint(exclude=NOT_IN_PARTS))
+    (path,) = tmp_path.glob("cache/fields/*.npz")
     whole = path.read_bytes()
+    solved.cache_clear()
     if damage == "other":
         np.savez(path, r_mm=np.zeros(3))
     else:
@@ -137,11 +139,12 @@ def test_any_bias_and_impurity_from_one_solution(
     more: list[str], caplog: pytest.LogCaptureFixture
 ) -> None:
     detector = read_detector("ppc", [*COARSE, *more])
-    solution = solve(detector)
+    solve(detector)
     for bias, scale, tilt in ((2500.0, 1.0, 0.0), (3000.0, 1.1, 0.03), (2200.0, 0.6, 0.0)):
         values = {"bias_V": bias, "impurity_scale": scale, "impurity_tilt_1e10_per_cm4": tilt}
-        wanted = detector.model_copy(update=values)
-        fields = superposed_fields(solution, wanted.model_copy(update={"temperature_K": 80}))
+        wanted = detector.model_copy(update=values | {"temperature_K": 80})
+        with caplog.at_level("DEBUG", "cpunet"):
+            fields = compute_fields(wanted)
         # solved for on its own, the impurities written down as they are
         z0 = scale * detector.impurity_z0_1e10_per_cm3 - tilt * detector.crystal_length / 20
         gradient = scale * detector.impurity_gradient_1e10_per_cm4 + tilt
@@ -153,27 +156,16 @@ def test_any_bias_and_impurity_from_one_solution(
                 getattr(fields, name), getattr(expected, name), atol=1e-6
             )
         assert fields.depletion_V == pytest.approx(expected.depletion_V, abs=1)
-        with caplog.at_level("DEBUG", "cpunet"):
-            again = compute_fields(wanted)
-        assert same(again, fields)
     assert not caplog.messages
 
 
-def test_the_scale_decides_whether_a_bias_depletes(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_scale_may_deplete_impurities_that_no_bias_depletes() -> None:
     plain = read_detector("ppc", COARSE)
     many = {"impurity_z0_1e10_per_cm3": -32.0, "impurity_gradient_1e10_per_cm4": 3.2}
-    # 40 times the impurities, which no bias depletes, and a scale that undoes it
     same_sum = plain.model_copy(update=many | {"impurity_scale": 1 / 40})
+    assert solve(same_sum).unit_depletion_V == np.inf
     expected = compute_fields(plain).depletion_V
     assert compute_fields(same_sum).depletion_V == pytest.approx(expected, abs=1)
-    with pytest.raises(CpunetError, match="give at least the depletion voltage, 18"):
-        compute_fields(same_sum.model_copy(update={"bias_V": 500.0}))
-    with pytest.raises(CpunetError, match="no bias up to 20000 V depletes it"):
-        compute_fields(plain.model_copy(update={"impurity_scale": 40.0}))
-    # the solution is kept although no bias depletes its impurities as given
-    caplog.set_level("DEBUG", "cpunet")
-    assert solve(same_sum).unit_depletion_V == np.inf
-    assert not caplog.messages
 
 
 @pytest.mark.parametrize("more", PARTS.values(), ids=PARTS)
@@ -187,12 +179,6 @@ def test_impurities_are_scaled_to_the_measured_depletion(
     # the bias is what the depletion was measured at: just depleted
     fields = compute_fields(scaled)
     assert fields.depletion_V == pytest.approx(measured, abs=1)
-    # and a solution of these impurities alone says so too
-    values = detector.model_dump()
-    for key in ("impurity_z0_1e10_per_cm3", "impurity_gradient_1e10_per_cm4"):
-        values[key] *= scaled.impurity_scale
-    alone = compute_fields(Detector.model_validate(values))
-    assert alone.depletion_V == pytest.approx(measured, abs=1)
 
 
 @pytest.mark.thorough
@@ -200,10 +186,11 @@ def test_a_detector_that_no_scale_depletes_at_the_measured_voltage() -> None:
     detector = read_detector("ppc", COARSE)
     with pytest.raises(CpunetError, match=r"no measured_depletion_V .* give"):
         scaled_to_depletion(detector)
-    values = {"measured_depletion_V": 2000.0, "surface_charge_1e10_per_cm2": -2.0}
-    with pytest.raises(CpunetError, match=r"2000 V do not deplete it even with 0.001"):
-        scaled_to_depletion(detector.model_copy(update=values))
+    charged = {"surface_charge_1e10_per_cm2": -2.0}
     pure = {"impurity_z0_1e10_per_cm3": 0.0, "impurity_gradient_1e10_per_cm4": 0.0}
-    values = {"measured_depletion_V": 2000.0, **pure}
-    with pytest.raises(CpunetError, match=r"even with 1000 times .* correct .* impurity_z0"):
-        scaled_to_depletion(detector.model_copy(update=values))
+    for values in (charged, pure):
+        wanted = detector.model_copy(update=values | {"measured_depletion_V": 2000.0})
+        with pytest.raises(
+            CpunetError, match=r"1000 times .* none depletes at 2000 V; correct"
+        ):
+            scaled_to_depletion(wanted)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import copy
 import json
 import logging
+import shutil
+from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ import pytest
 import yaml
 
 from cpunet.errors import CpunetError
+from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from synthetic import one_line
@@ -83,6 +86,7 @@ def test_a_siggen_configuration_is_the_same_detector(tmp_path: Path) -> None:
         ("pc_radius 2.3", "pc_radios 2.3", "pc_radios"),
         ("pc_radius 2.3", "", "point_contact_radius"),
         ("bulletize_PC 0", "bulletize_PC 1", "bulletize_PC"),
+        ("bulletize_PC 0", "hole_offset_y_top 4", "is not 0; only axially symmetric"),
     ],
 )
 def test_bad_siggen_lines_are_named(tmp_path: Path, old: str, new: str, key: str) -> None:
@@ -176,6 +180,22 @@ def test_the_public_metadata(reference_data: Path) -> None:
     assert "type 'coax' is not simulated" in refused(diodes / "C99000A.yaml")
 
 
+@pytest.mark.usefixtures("own_cache")
+def test_impurities_by_the_depletion_voltage(
+    reference_data: Path, tmp_path: Path, caplog
+) -> None:
+    caplog.set_level("INFO", "cpunet")
+    metadata = reference_data / "legend-metadata"
+    diode = Path(shutil.copy(metadata / "diodes" / "P99000A.yaml", tmp_path))
+    shutil.copy(metadata / "crystals" / "V99000.yaml", tmp_path / "P99000.yaml")
+    values = ["temperature_K=85", "bias_V=3300", "grid_mm=0.5", "impurity_scale=depletion"]
+    scaled = read_detector(diode, values)
+    assert "so that it depletes at the measured 3000 V" in caplog.text
+    # with the maker's impurities, P99000A would deplete at some 2260 V
+    assert 1.2 < scaled.impurity_scale < 1.5
+    assert compute_fields(scaled).depletion_V == pytest.approx(3000, abs=1)
+
+
 @pytest.mark.parametrize(
     ("place", "value", "said"),
     [
@@ -192,10 +212,7 @@ def test_wrong_crystals_name_the_field(
 ) -> None:
     crystal = copy.deepcopy(CRYSTAL)
     *folders, last = place.split(".")
-    node = crystal
-    for key in folders:
-        node = node[key]
-    node[last] = value
+    reduce(dict.__getitem__, folders, crystal)[last] = value
     path = metadata(tmp_path, crystal, DIODE)
     file = f"{tmp_path / 'crystals' / 'B99000.yaml'}: "
     read = lambda: read_detector(path, ["temperature_K=90"])  # noqa: E731
@@ -324,11 +341,6 @@ def test_what_was_cut_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) 
         siggen(tmp_path, "pc_radius 14")
     (said,) = caplog.messages
     assert "pc_radius is 12 mm, as in siggen: at most wrap_around_radius - ditch_th" in said
-
-
-def test_holes_beside_the_axis_are_refused(tmp_path: Path) -> None:
-    with pytest.raises(CpunetError, match="hole_offset_y_top is not 0; only axially symmetric"):
-        siggen(tmp_path, "hole_offset_y_top 4")
 
 
 def legend(folder: Path, *extra: object) -> Detector:

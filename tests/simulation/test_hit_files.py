@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Any
 
@@ -104,7 +103,7 @@ def test_late_deposits_are_counted(tmp_path, caplog) -> None:
         time = TIME_NS.copy()
         time[1::9] += later_ns  # 20 us are longer than what one event lasts
         hits = read_hits(written(tmp_path, "vectors", steps(time=(time, "ns"))))
-        assert hits.n_events == n_events
+        assert len(hits) == n_events
         assert len(caplog.messages) == told
         text = f"{N // 3} events have deposits more than 50 ns after their first"
         assert all(text in message for message in caplog.messages)
@@ -144,23 +143,20 @@ def test_links_to_steps_of_other_files(tmp_path: Path) -> None:
         read_hits(tmp_path / "all.h5", HitOptions("one"))
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-def test_detectors_of_one_table(tmp_path: Path, layout: str) -> None:
-    uid = np.tile([11, 11, 2], N)  # the daughter's gamma goes to another crystal
-    path = written(tmp_path, layout, steps(det_uid=(uid, "")), "germanium")
+@pytest.mark.parametrize(
+    ("layout", "column", "detectors"),
+    [*((layout, "det_uid", [11, 2]) for layout in LAYOUTS), ("csv", "volume", ["V1", "B"])],
+)
+def test_detectors_of_one_table(tmp_path: Path, layout: str, column: str, detectors) -> None:
+    large, small = detectors
+    of = np.tile([large, large, small], N)  # the daughter's gamma goes to another crystal
+    path = written(tmp_path, layout, steps(**{column: (of, "")}), "germanium")
     told = {name: dict(lines)["hits"] for name, lines in describe_hits(path, {}).items()}
-    assert told == {"2": f"{N} of {N} events", "11": f"{2 * N} of {N} events"}
-    with pytest.raises(CpunetError, match=r"holds detectors 2, 11; choose .*`hits_detector`"):
+    assert told == {f"{small}": f"{N} of {N} events", f"{large}": f"{2 * N} of {N} events"}
+    with pytest.raises(CpunetError, match=f"holds detectors {small}, {large}; choose"):
         read_hits(path)
-    np.testing.assert_allclose(read_hits(path, HitOptions("11")).energy_kev, 2614.5)
-    np.testing.assert_allclose(read_hits(path, HitOptions("2")).energy_kev, 238.6)
-
-
-def test_detectors_by_the_names_of_their_volumes(tmp_path: Path) -> None:
-    names = np.tile(["V01", "V01", "B02"], N)
-    path = written(tmp_path, "csv", steps(volume=(names, "")))
-    assert list(describe_hits(path, {})) == ["B02", "V01"]
-    np.testing.assert_allclose(read_hits(path, HitOptions("B02")).energy_kev, 238.6)
+    np.testing.assert_allclose(read_hits(path, HitOptions(f"{large}")).energy_kev, 2614.5)
+    np.testing.assert_allclose(read_hits(path, HitOptions(f"{small}")).energy_kev, 238.6)
 
 
 @pytest.mark.parametrize("layout", ["flat", "csv", "hdf5"])
@@ -199,31 +195,18 @@ def test_rows_in_the_order_of_time_stay_together(tmp_path: Path) -> None:
     np.testing.assert_allclose(sorted(hits.energy_kev), sorted(SEEN_KEV))
 
 
-@pytest.mark.parametrize("layout", LAYOUTS)
-@pytest.mark.parametrize("change", [{"edep": (EDEP_KEV, "J")}, {"time": (TIME_NS, "min")}])
-def test_units_that_are_not_known_are_refused(tmp_path, layout, change) -> None:
-    path = written(tmp_path, layout, steps(**change))
-    with pytest.raises(CpunetError, match=r"is in '(J|min)'; expected one of"):
-        read_hits(path)
-
-
-@pytest.mark.parametrize(
-    ("factor", "said"), [(1e-3, "up to 2.615 keV"), (1e3, "2.614e.06 keV")]
-)
-def test_energies_of_another_unit_are_named(tmp_path, factor, said) -> None:
-    path = written(tmp_path, "flat", steps(edep=(factor * EDEP_KEV, "keV")))
-    with pytest.raises(CpunetError, match=rf"{said}.* correct the unit of their column"):
-        read_hits(path)
-
-
 @pytest.mark.parametrize(
     ("change", "said"),
     [
+        ({"edep": (EDEP_KEV, "J")}, "is in 'J'; expected one of keV"),
+        ({"time": (TIME_NS, "min")}, "is in 'min'; expected one of ns"),
+        ({"edep": (1e-3 * EDEP_KEV, "keV")}, "up to 2.615 keV, are no deposits in germanium"),
+        ({"edep": (1e3 * EDEP_KEV, "keV")}, "2.614e+06 keV, are no deposits in germanium"),
         ({"time": (np.full(3 * N, np.nan), "ns")}, "event 0: a step has no finite position or"),
         ({"evtid": (np.where(EVENT == 0, np.nan, EVENT), "")}, "column evtid"),
     ],
 )
-def test_what_is_wrong_with_values_is_told(tmp_path, change, said) -> None:
+def test_wrong_columns_are_named(tmp_path: Path, change: dict[str, Column], said: str) -> None:
     path = written(tmp_path, "flat", steps(**change))
     one_line(lambda: read_hits(path), said, str(path))
 
@@ -245,12 +228,10 @@ def test_damaged_files_of_remage(tmp_path: Path) -> None:
     one_line(lambda: read_hits(path), "no table of stp or default_ntuples has columns")
 
 
-@pytest.mark.parametrize("origin", [0.01, np.array([0.01])])
-def test_an_origin_is_a_number_or_an_array_of_one(tmp_path: Path, origin: object) -> None:
+def test_an_origin_in_m_of_an_array_of_one(tmp_path: Path) -> None:
     path = written(tmp_path, "vectors", steps())
     with h5py.File(path, "r+") as file:
-        file["detector_origins/det1/xloc"] = origin  # in m
-        file["detector_origins/det1/yloc"] = file["detector_origins/det1/zloc"] = 0.0
+        file["detector_origins/det1/xloc"] = np.array([0.01])
     assert (read_hits(path).x_mm == -10).all()
 
 
@@ -274,7 +255,7 @@ def test_blocks_hold_all_events_of_a_window(tmp_path, monkeypatch) -> None:
 def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
     path = reference_data / "geant4" / "remage-th228-stp.lh5"
     hits = read_hits(path, HitOptions("det1"))
-    assert (hits.n_events, len(hits.edep_kev)) == (16, 342)
+    assert (len(hits), len(hits.edep_kev)) == (16, 342)
     assert hits.energy_kev[0] == pytest.approx(200.0)
     assert hits.event_number[:3].tolist() == [36, 45, 106]
     assert 10 < hits.x_mm.min() < hits.x_mm.max() < 50
@@ -282,46 +263,35 @@ def test_remage_detector_relative_to_its_origin(reference_data: Path) -> None:
         read_hits(path, HitOptions("optdet1"))
 
 
-def test_truncated_hdf5_is_one_line(reference_data: Path, tmp_path: Path) -> None:
-    whole = (reference_data / "geant4" / "remage-th228-stp.lh5").read_bytes()
-    for share in (0.001, 0.3, 0.9):
-        path = tmp_path / "cut.lh5"
-        path.write_bytes(whole[: int(share * len(whole))])
-        with pytest.raises(CpunetError, match="truncated"):
-            read_hits(path, HitOptions("det1"))
-
-
 def test_geant4_csv_needs_units(reference_data: Path) -> None:
     path = reference_data / "geant4" / "single-invcoax-th228-geant4.csv"
     hits = read_hits(path, HitOptions(units="keV, mm"))
-    assert (hits.n_events, len(hits.edep_kev)) == (124, 1411)
+    assert (len(hits), len(hits.edep_kev)) == (124, 1411)
     assert hits.event_number[0] == 2
     assert 2500 < hits.energy_kev.max() < 2615
 
 
 def test_g4simple_is_in_mev_and_mm(tmp_path: Path) -> None:
-    def read(**changed: list[float]) -> Hits:
-        columns = {"event": [4, 4, 7, 7, 7], "volID": [1, 1, 1, 2, 0]}
-        columns |= {"Edep": [0.5, 1.0, 0.25, 0.3, 0.0], "x": [0, 1, 2, 3, 4], "y": [0] * 5}
-        columns |= {"z": [1, 2, 3, 4, 5]} | changed
-        arrays = {name: (np.array(values), "") for name, values in columns.items()}
-        path = ntuple_hdf5(tmp_path / "hits.hdf5", arrays, "g4sntuple")
-        return read_hits(path, HitOptions("1"))
-
-    hits = read()
+    columns = {"event": [4, 4, 7, 7, 7], "volID": [1, 1, 1, 2, 0], "y": [0, 0, 0, 0, 0]}
+    columns |= {"Edep": [0.5, 1, 0.25, 0.3, 0], "x": [0, 1, 2, 3, 4], "z": [1, 2, 3, 4, 5]}
+    arrays = {name: (np.array(values), "") for name, values in columns.items()}
+    path = ntuple_hdf5(tmp_path / "hits.hdf5", arrays, "g4sntuple")
+    hits = read_hits(path, HitOptions("1"))
     np.testing.assert_allclose(hits.energy_kev, [1500, 250])
     np.testing.assert_array_equal(hits.event_number, [4, 7])
     np.testing.assert_array_equal(hits.z_mm, [1, 2, 3])
+    path = ntuple_hdf5(path, arrays | {"x": (np.zeros(3), "")}, "g4sntuple")
     with pytest.raises(CpunetError, match="differ in length"):
-        read(x=[0, 0, 0])
+        read_hits(path, HitOptions("1"))
 
 
 def test_g4simple_csv_and_bracketed_units(tmp_path: Path) -> None:
     rows = ["3,1,10,20,30", "3,0,0,0,0", "5,0.5,1,2,3"]
-    plain = csv_file(tmp_path, ["event", "Edep", "x", "y", "z"], rows, title="steps data")
-    hits = read_hits(plain)
+    plain = csv_file(tmp_path, STEP, rows, title="steps data")
+    hits = read_hits(plain, HitOptions(origin=(1, 2, 50), flip_z=True))
     np.testing.assert_allclose(hits.energy_kev, [1000, 500])
-    assert len(hits.edep_kev) == 2  # a step without a deposit is none
+    # a step without a deposit is none; y and z are turned about x
+    np.testing.assert_allclose(hits.position_mm, [[9, -18, 20], [0, 0, 47]])
     named = ["event", "Edep [GeV]", "x [cm]", "y [cm]", "z [m]"]
     rows = ["3,0.001,10,20,30", "5,0.0005,1,2,3"]
     hits = read_hits(csv_file(tmp_path, named, rows))
@@ -329,23 +299,18 @@ def test_g4simple_csv_and_bracketed_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(hits.position_mm[0], [100, 200, 30_000])
 
 
-def test_transform_to_the_crystal(tmp_path: Path) -> None:
-    path = csv_file(
-        tmp_path, ["event", "Edep", "x", "y", "z"], ["1,1,10,20,30"], title="steps data"
-    )
-    flipped = HitOptions(origin=(1, 2, 50), flip_z=True)
-    np.testing.assert_allclose(read_hits(path, flipped).position_mm, [[9, -18, 20]])
+STEP = ["event", "Edep", "x", "y", "z"]
 
 
 @pytest.mark.parametrize(
     ("columns", "rows", "message"),
     [
         (["event", "x", "y", "z"], ["1,2,3,4"], "no column for edep"),
-        (["event", "Edep", "x", "y", "z"], ["1,2,3,4,5", "1,2"], "is it cut off"),
-        (["event", "Edep", "x", "y", "z"], ["1,2,3"], "3 values a line for 5 columns"),
-        (["event", "Edep", "x", "y", "z"], [], "holds no steps"),
-        (["event", "Edep", "x", "y", "z"], ["8,-2,3,4,5"], "event 8: a step"),
-        (["event", "Edep", "x", "y", "z"], ["8,0,3,4,5"], "no step deposits energy"),
+        (STEP, ["1,2,3,4,5", "1,2"], "is it cut off"),
+        (STEP, ["1,2,3"], "3 values a line for 5 columns"),
+        (STEP, [], "holds no steps"),
+        (STEP, ["8,-2,3,4,5"], "event 8: a step"),
+        (STEP, ["8,0,3,4,5"], "no step deposits energy"),
     ],
 )
 def test_bad_csv_is_one_line(
@@ -363,29 +328,26 @@ def test_foreign_files_are_one_line(tmp_path: Path, content: bytes) -> None:
         read_hits(path)
 
 
-GOOD = {
-    "x_mm": np.array([1.0, 2, 3]),
-    "y_mm": np.zeros(3),
-    "z_mm": np.array([10.0, 20, 30]),
-    "edep_keV": np.array([500.0, 600, 700]),
-    "offsets": np.array([0, 2, 3]),
-}
-NPZ_DEFECTS = [
-    ("x_mm", np.array([np.nan, 0, 0])),
-    ("x_mm", np.array(["1", "2", "3"])),
-    ("edep_keV", np.array([500.0, 600])),
-    ("edep_keV", np.array([-1.0, 1, 1])),
-    ("offsets", np.array([0, 1.5, 3])),
-    ("offsets", np.array([0, 3, 2])),
-]
+GOOD = {"x_mm": [1.0, 2, 3], "y_mm": [0.0, 0, 0], "z_mm": [10.0, 20, 30]}
+GOOD |= {"edep_keV": [500.0, 600, 700], "offsets": [0, 2, 3]}
 
 
-@pytest.mark.parametrize(("name", "values"), NPZ_DEFECTS)
-def test_archives(tmp_path: Path, name: str, values: np.ndarray) -> None:
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("x_mm", [np.nan, 0, 0]),
+        ("x_mm", ["1", "2", "3"]),
+        ("edep_keV", [500.0, 600]),
+        ("edep_keV", [-1.0, 1, 1]),
+        ("offsets", [0, 1.5, 3]),
+        ("offsets", [0, 3, 2]),
+        ("offsets", [0, 2, 4]),
+    ],
+)
+def test_archives(tmp_path: Path, name: str, values: list[Any]) -> None:
     path = tmp_path / "hits.npz"
     np.savez(path, **(GOOD | {name: values}))
-    with pytest.raises(CpunetError, match=rf"^{re.escape(str(path))}: [^\n]+$"):
-        read_hits(path)
+    one_line(lambda: read_hits(path), str(path))
 
 
 def test_archives_name_no_detector_and_a_far_origin_is_refused(tmp_path: Path) -> None:

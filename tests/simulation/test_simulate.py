@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import json
-import shutil
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import h5py
 import lh5
@@ -131,30 +129,6 @@ def test_the_file_tells_how_it_was_made_and_keeps_its_hits(ppc, source, tmp_path
     assert SimulationSettings.model_validate(made["settings"]) == SimulationSettings(**SETTINGS)
     assert (made["seed"], made["hits"]["file"]) == (11, str(source.path))
     assert attributes["made_by"].startswith("cpunet simulate ")
-
-
-def test_a_diode_of_legend_with_its_crystal(source, reference_data, tmp_path: Path, caplog):
-    caplog.set_level("INFO", "cpunet")
-    metadata, out = reference_data / "legend-metadata", tmp_path / "a.lh5"
-    diode = Path(shutil.copy(metadata / "diodes" / "P99000A.yaml", tmp_path))
-    values = {
-        "temperature_K": 85,
-        "bias_V": 3300,
-        "grid_mm": 0.5,
-        "impurity_scale": "depletion",
-    }
-    given: dict[str, Any] = {"detector": diode, "hits": source, "settings": values}
-    with pytest.raises(CpunetError, match="give `settings` impurity_z0"):
-        simulate(out, **given)
-    shutil.copy(metadata / "crystals" / "V99000.yaml", tmp_path / "P99000.yaml")
-    simulate(out, **given)
-    assert "so that it depletes at the measured 3000 V" in caplog.text
-    with h5py.File(out) as file:
-        made = json.loads(file["geds/sim"].attrs["simulation"])
-    assert made["detector"]["measured_depletion_V"] == 3000
-    assert made["depletion_V"] == pytest.approx(3000, abs=1)
-    # simulated with the maker's impurities, P99000A would deplete at some 2260 V
-    assert 1.2 < made["detector"]["impurity_scale"] < 1.5
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.ndimage import gaussian_filter1d
 
 from cpunet.errors import CpunetError
 from cpunet.simulation.field_lookup import ELECTRON, HOLE, carrier_velocity, velocity_table
@@ -202,3 +203,42 @@ def test_holes_slide_along_the_ditch_and_are_not_collected_there() -> None:
     np.testing.assert_allclose(holes[:, -1, 2], 0, atol=0.01)
     corner = simulator.fields.weighting_potential[44, 0]  # at 11 mm
     np.testing.assert_allclose(signals.waveforms[held, -1], corner, atol=0.02)
+
+
+@pytest.mark.usefixtures("own_cache")
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"temperature_K": 92.0},
+        {"impurity_scale": 1.03},
+        {"hole_velocity_low_factor": 0.97},
+        {"cloud_fwhm_mm": 0.5},
+        {"hole_trapping_per_us": 0.05},
+    ],
+    ids=lambda values: str(next(iter(values))),
+)
+def test_quick_differences_are_the_exact_ones(values: dict[str, float]) -> None:
+    detector, settings = (
+        read_detector("ppc", ["grid_mm=0.5"]),
+        SimulationSettings(length_ns=1600),
+    )
+    rng = np.random.default_rng(1)
+    size, length = detector.crystal_radius / 1.4, detector.crystal_length
+    place = rng.uniform([-size, -size, 0], [size, size, length], (120, 3))
+    hits = Hits.of(place, rng.uniform(50, 1000, 120), np.arange(0, 121, 3))
+
+    def change(quick: bool) -> Array:
+        other = [
+            part.model_copy(update={k: v for k, v in values.items() if hasattr(part, k)})
+            for part in (detector, settings)
+        ]
+        pulses = [
+            Simulator(*physics, quick=quick).events(hits).waveforms.astype(float)
+            for physics in ((detector, settings), other)
+        ]
+        # as after the electronics, whose bandwidth sharp edges do not pass
+        return gaussian_filter1d(pulses[1] - pulses[0], 24 / settings.dt_ns, axis=1)
+
+    exact = change(quick=False)
+    error = np.sqrt(np.mean((change(quick=True) - exact) ** 2) / np.mean(exact**2))
+    assert 0 < error < 0.1

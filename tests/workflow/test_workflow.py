@@ -495,9 +495,9 @@ def require_parameters(folder: Path, name: str, part: str, hits: Any) -> None:
     numbers = table["event_number"].nda
     assert numbers.tolist() == raw["event_number"].nda.tolist()
     assert set(numbers) <= set(hits.event_number)
-    assert len(numbers) > 0.7 * hits.n_events
+    assert len(numbers) > 0.7 * len(hits)
     good = (table["rejection"].nda == 0) & (table["energy"].nda > 300)
-    assert good.sum() > 0.5 * hits.n_events
+    assert good.sum() > 0.5 * len(hits)
     gain = table["trapEmax"].nda[good] / table["energy"].nda[good]
     assert np.std(gain) < 0.01 * np.mean(gain)
     assert np.isfinite(table["AoE"].nda[good]).all()

@@ -25,7 +25,7 @@ from numba import prange
 from cpunet.calibration.nuisances import Physics, Values
 from cpunet.kernels import kernel
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.simulate import SameHits
+from cpunet.simulation.simulator import Simulator as DetectorSimulator
 
 FloatArray = npt.NDArray[np.float32]
 # Factors by which the sampling period is divided for alignment; the first possible is used.
@@ -105,14 +105,14 @@ class Simulator:
     def __init__(self, hits: Hits, physics: Physics) -> None:
         self.physics = physics
         self.simulated: Callable[[], None] = lambda: None
-        self._same = SameHits(hits)
+        self._hits = hits
         steps = physics.settings.dt_ns / physics.settings.step_ns
         self._finer = next(n for n in FINER if abs(steps / n - round(steps / n)) < 1e-9)
 
     def exact(self, coordinates: Values) -> FloatArray:
         """Pulses as `cpunet simulate` produces them, shape (events, samples)."""
         detector, settings = self.physics.at(coordinates)
-        events = self._same.simulate(detector, settings)
+        events = DetectorSimulator(detector, settings).events(self._hits)
         self.simulated()
         return events.waveforms
 
@@ -120,7 +120,7 @@ class Simulator:
         """Finely sampled pulses of the first `most` events, for differences."""
         detector, settings = self.physics.at(coordinates)
         fine = settings.model_copy(update={"dt_ns": settings.dt_ns / self._finer})
-        events = self._same.simulate(detector, fine, quick=True, most=most)
+        events = DetectorSimulator(detector, fine, quick=True).events(self._hits[:most])
         self.simulated()
         return events.waveforms
 

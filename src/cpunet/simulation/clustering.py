@@ -13,7 +13,9 @@ Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 
-def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
+def cluster_hits(
+    hits: Hits, distance_mm: float, alone: npt.NDArray[np.bool_] | None = None
+) -> Hits:
     r"""Merge hits of an event that are closer together than a distance.
 
     Single linkage: hits connected by a chain of neighbours at most `distance_mm` apart become
@@ -29,6 +31,8 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
         Events as read or simulated.
     distance_mm
         Maximum distance between neighbours in mm. 0 merges only hits at the same position.
+    alone
+        Which hits are never merged; by default none.
 
     Examples
     --------
@@ -38,7 +42,8 @@ def cluster_hits(hits: Hits, distance_mm: float) -> Hits:
     (array([1.75, 9.  ]), array([400.,  50.]))
     """
     near = float(distance_mm) ** 2  # always a float, so that the loop is compiled only once
-    merged, offsets = _merge(hits.position_mm, hits.edep_kev, hits.offsets, near)
+    alone = np.zeros(len(hits.edep_kev), np.bool_) if alone is None else alone
+    merged, offsets = _merge(hits.position_mm, hits.edep_kev, hits.offsets, alone, near)
     return Hits.of(merged[:, :3], merged[:, 3].copy(), offsets, hits.event_number)
 
 
@@ -51,20 +56,20 @@ def merge_hits(hits: Hits, detector: Detector, distance_mm: float) -> Hits:
     """
     if distance_mm == 0:
         return hits
-    active = detector.active(hits.r_mm, hits.z_mm)
-    parts = cluster_hits(hits.where(active), distance_mm), hits.where(~active)
-    order = np.argsort(np.concatenate([part.event_of_hit for part in parts]), kind="stable")
-    return Hits.of(
-        np.concatenate([part.position_mm for part in parts])[order],
-        np.concatenate([part.edep_kev for part in parts])[order],
-        parts[0].offsets + parts[1].offsets,
-        hits.event_number,
-    )
+    outside = ~detector.active(hits.r_mm, hits.z_mm)
+    order = np.lexsort((outside, hits.event_of_hit))  # the last hits of each event
+    sorted_hits = hits.position_mm[order], hits.edep_kev[order]
+    hits = Hits.of(*sorted_hits, hits.offsets, hits.event_number)
+    return cluster_hits(hits, distance_mm, outside[order])
 
 
 @kernel
 def _merge(
-    position: Array, energy: Array, offsets: Integers, distance2: float
+    position: Array,
+    energy: Array,
+    offsets: Integers,
+    alone: npt.NDArray[np.bool_],
+    distance2: float,
 ) -> tuple[Array, Integers]:
     """Clusters as rows (x, y, z, energy), and the offsets of the events."""
     merged = np.zeros((len(energy), 4))
@@ -81,11 +86,11 @@ def _merge(
             label[first] = n
             queue[0] = first
             done, waiting = 0, 1
-            while done < waiting:
+            while done < waiting and not alone[first]:
                 mine = queue[done]
                 done += 1
                 for other in range(first + 1, end):
-                    if label[other] >= 0:
+                    if label[other] >= 0 or alone[other]:
                         continue
                     square = 0.0
                     for axis in range(3):

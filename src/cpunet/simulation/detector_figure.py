@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from matplotlib.colors import LogNorm
+from matplotlib.colors import ListedColormap, LogNorm
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -88,21 +88,19 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     # contacts and lithium layer filled, the outside and the ditch blank
     step = max(detector.crystal_length, detector.crystal_radius) / _OUTLINE_POINTS
     at_r = np.arange(0, 1.05 * detector.crystal_radius, step)
-    at_z = np.arange(0, 1.05 * detector.crystal_length, step)
+    at_z = np.arange(-step, 1.05 * detector.crystal_length, step)  # the face has an outside
     rr, zz = np.meshgrid(at_r, at_z)
     inside, region = detector.inside(rr, zz), detector.region(rr, zz)
-    covers = [(~inside, "white")]
-    covers += [(inside & (region == n), c) for n, _, c in _REGIONS]
+    cover = np.full(rr.shape, np.nan)
+    for number, (of, _, _) in enumerate(_REGIONS):
+        cover[region == of] = number
+    cover[~inside] = len(_REGIONS)
+    covers = ListedColormap([*(colour for _, _, colour in _REGIONS), "white"])
     for axes in panels:
-        for where, colour in covers:
-            # slightly too wide, so that no gap shows between two patches
-            cover = where.astype(float)
-            axes.contourf(at_r, at_z, cover, [0.3, 1.5], colors=[colour], zorder=2.2)
-        edge = inside.astype(float)
-        axes.contour(at_r, at_z, edge, [0.5], colors="black", linewidths=1.0, zorder=2.3)
-        # contours do not run along the edge of the axes
-        bottom = np.where(inside[0], 0.0, np.nan)
-        axes.plot(at_r, bottom, color="black", linewidth=1.0, zorder=2.3)
+        axes.pcolormesh(at_r, at_z, cover, cmap=covers, zorder=2.2, rasterized=True)
+        axes.contour(
+            at_r, at_z, inside.astype(float), [0.5], colors="black", linewidths=1.0, zorder=2.3
+        )
         axes.set(xlabel="r [mm]", aspect="equal")
         axes.grid(visible=False)
         axes.set_xlim(0, detector.crystal_radius * 1.02)

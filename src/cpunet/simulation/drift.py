@@ -157,7 +157,15 @@ def smear_and_sample(
         Samples to which the result is added.
     """
     reach = 0 if sigma < 0.3 else int(_CUT_FWHM * FWHM_PER_SIGMA * sigma) + 1
-    kernel = _gaussian_block(per_sample, sigma, reach)
+    # the Gaussian, summed over a block and normalised
+    kernel = np.zeros(per_sample + 2 * reach)
+    norm = 0.0
+    for d in range(-reach, reach + 1):
+        height = math.exp(-0.5 * (d / sigma) ** 2) if d != 0 else 1.0
+        norm += height * per_sample
+        for m in range(per_sample):
+            kernel[d + reach + m] += height
+    kernel = kernel / norm
     final = weight * signal[len(signal) - 1]
     for j in range(len(out)):
         begin = j * per_sample - reach
@@ -172,19 +180,6 @@ def smear_and_sample(
         for m in range(max(high, 0), len(kernel)):
             total += kernel[m] * signal[len(signal) - 1]
         out[j] += weight * total
-
-
-@kernel
-def _gaussian_block(per_sample: int, sigma: float, reach: int) -> FloatArray:
-    """Gaussian of `sigma` steps, truncated at `reach`, summed over a block and normalised."""
-    kernel = np.zeros(per_sample + 2 * reach)
-    total = 0.0
-    for d in range(-reach, reach + 1):
-        height = math.exp(-0.5 * (d / sigma) ** 2) if d != 0 else 1.0
-        total += height * per_sample
-        for m in range(per_sample):
-            kernel[d + reach + m] += height
-    return kernel / total
 
 
 # A carrier is collected once its signal can change by less than this fraction of full scale.

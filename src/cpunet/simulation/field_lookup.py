@@ -35,7 +35,7 @@ FloatArray = npt.NDArray[np.float64]
 
 ELECTRON, HOLE = 0, 1
 
-# Columns of `VelocityTable.coefficients`.
+# Columns of the coefficients of `velocity_table`.
 A, B, C, B_MEAN, C_MEAN, V100 = range(6)
 
 _TABLE_K = 77.0
@@ -54,21 +54,10 @@ VelocityFactors = tuple[tuple[float, float], tuple[float, float]]
 AS_MEASURED: VelocityFactors = ((1.0, 1.0), (1.0, 1.0))
 
 
-class VelocityTable(NamedTuple):
-    """Anisotropy coefficients at equidistant field strengths, interpolated linearly.
-
-    ``coefficients`` has shape ``(2 carriers, n fields, 6)`` in mm/ns: a, b, c, the means of
-    b and c over fields from 0 upwards, and the speed along <100>.
-    """
-
-    coefficients: FloatArray
-    fields_per_V_per_cm: float
-
-
 def velocity_table(
     temperature_K: float, factors: VelocityFactors = AS_MEASURED
-) -> VelocityTable:
-    r"""Anisotropy coefficients at a crystal temperature.
+) -> tuple[FloatArray, float]:
+    r"""Anisotropy coefficients at equidistant field strengths, for a crystal temperature.
 
     The speeds at 77 K along <100>, <110> and <111> are multiplied by :math:`f(T)/f(77)` with
 
@@ -87,6 +76,14 @@ def velocity_table(
         Crystal temperature in K. It is limited to 40-120 K, the range of the model.
     factors
         Speed factors common to all axes, see `velocity_factor`.
+
+    Returns
+    -------
+    coefficients
+        Shape ``(2 carriers, n fields, 6)``, in mm/ns: a, b, c, the means of b and c over fields
+        from 0 upwards, and the speed along <100>. They are interpolated linearly.
+    per_field
+        Number of rows per V/cm.
 
     References
     ----------
@@ -107,19 +104,27 @@ def velocity_table(
     step = float(np.gcd.reduce(np.round(field).astype(np.int64)))
     grid = np.arange(round(field[-1] / step) + 1) * step
     low, high = _RANGE_K
-    within = min(max(temperature_K, low), high)
     tables = []
     for carrier in (ELECTRON, HOLE):
-        now, then = (_speed_model(carrier, field, kelvin) for kelvin in (within, _TABLE_K))
+        speeds = []
+        for kelvin in (min(max(temperature_K, low), high), _TABLE_K):
+            saturation = _SPEED[carrier] * math.sqrt(math.tanh(_THETA_K / (2 * kelvin)))
+            x = field * _MOBILITY[carrier] * kelvin ** _POWER[carrier] / saturation
+            speeds.append(saturation * x / np.sqrt(1 + x**2))
+        now, then = speeds
         factor = np.divide(now, then, out=np.ones_like(field), where=then > 0)
         factor = factor * velocity_factor(field, *factors[carrier])
         v100, v110, v111 = (measured[:, 1 + 3 * carrier : 4 + 3 * carrier] * factor[:, None]).T
         a = v100 / 2 - 4 * v110 + 4.5 * v111
         b = -2.5 * v100 + 16 * v110 - 13.5 * v111
         c = 3 * v100 - 12 * v110 + 9 * v111
-        columns = (a, b, c, _running_mean(field, b), _running_mean(field, c), v100)
+        means = []
+        for values in (b, c):
+            integral = cumulative_trapezoid(values, field, initial=0)
+            means.append(np.divide(integral, field, out=values.copy(), where=field > 0))
+        columns = (a, b, c, *means, v100)
         tables.append(np.stack([np.interp(grid, field, column) for column in columns], 1))
-    return VelocityTable(np.ascontiguousarray(tables), 1 / step)
+    return np.ascontiguousarray(tables), 1 / step
 
 
 def velocity_factor(field_V_per_cm: npt.ArrayLike, low: float, high: float) -> FloatArray:
@@ -136,19 +141,6 @@ def velocity_factor(field_V_per_cm: npt.ArrayLike, low: float, high: float) -> F
     field = np.clip(np.asarray(field_V_per_cm, np.float64), _LOW_FIELD, _HIGH_FIELD)
     x = np.log(field / _LOW_FIELD) / math.log(_HIGH_FIELD / _LOW_FIELD)
     return np.asarray(low + (high - low) * x * x * (3 - 2 * x), np.float64)
-
-
-def _speed_model(carrier: int, field: FloatArray, temperature_K: float) -> FloatArray:
-    saturation = _SPEED[carrier] * math.sqrt(math.tanh(_THETA_K / (2 * temperature_K)))
-    x = field * _MOBILITY[carrier] * temperature_K ** _POWER[carrier] / saturation
-    return np.asarray(saturation * x / np.sqrt(1 + x**2), dtype=np.float64)
-
-
-def _running_mean(field: FloatArray, values: FloatArray) -> FloatArray:
-    """Mean of `values` over fields from 0 to each field, by the trapezoidal rule."""
-    integral = cumulative_trapezoid(values, field, initial=0)
-    mean: FloatArray = np.divide(integral, field, out=values.copy(), where=field > 0)
-    return mean
 
 
 @kernel(inline="always")
@@ -242,19 +234,37 @@ def drift_maps(
     if parts > 1:
         for _ in range(_SPLINE_GHOSTS):
             values, filled = with_ghost_nodes(values, filled)
-        values = _refined(values, parts, mirror=not stacked[:, 0, E_Z].any())
-        cells = np.kron(_all_corners(ditch), np.ones((parts, parts), np.bool_))
-        ditch = ~_all_corners(~np.pad(cells, 1))  # nodes at the corners of these cells
-        usable = np.kron(usable, np.ones((parts, parts), np.bool_))
-    table = velocity_table(temperature_K, settings.velocity_factors)
+        # The axis is a mirror, as is z = 0 without a field across it: such fields are odd.
+        n = _SPLINE_MIRROR
+        odd_r, odd_z = np.ones(4), np.ones(4)
+        odd_r[E_R] = odd_z[E_Z] = -1
+        values = np.concatenate([values[n:0:-1] * odd_r, values])
+        below = 0 if stacked[:, 0, E_Z].any() else n
+        if below:
+            values = np.concatenate([values[:, n:0:-1] * odd_z, values], axis=1)
+        r, z = np.arange(values.shape[0]) - n, np.arange(values.shape[1]) - below
+        fine_r, fine_z = (np.arange(nodes[-1] * parts + 1) / parts for nodes in (r, z))
+        splines = [RectBivariateSpline(r, z, values[..., k], s=0) for k in range(4)]
+        values = np.stack([spline(fine_r, fine_z) for spline in splines], axis=-1)
+        fine = np.ones((parts, parts), np.bool_)
+        # nodes at the corners of the cells of the ditch
+        ditch = ~_all_corners(~np.pad(np.kron(_all_corners(ditch), fine), 1))
+        usable = np.kron(usable, fine)
+    coefficients, per_field = velocity_table(
+        temperature_K,
+        (
+            (settings.electron_velocity_low_factor, settings.electron_velocity_high_factor),
+            (settings.hole_velocity_low_factor, settings.hole_velocity_high_factor),
+        ),
+    )
     return DriftMaps(
         values=np.ascontiguousarray(values),
         usable=usable,
         ditch=np.ascontiguousarray(ditch[:, : ditch.any(0).argmin()]),
         per_mm=parts / fields.grid_mm,
         bias_V=bias,
-        coefficients=table.coefficients,
-        fields_per_V_per_cm=table.fields_per_V_per_cm,
+        coefficients=coefficients,
+        fields_per_V_per_cm=per_field,
         trapping_per_ns=np.array(settings.trapping_per_ns),
     )
 
@@ -262,25 +272,6 @@ def drift_maps(
 def _all_corners(nodes: BoolArray) -> BoolArray:
     """Cells (nr - 1, nz - 1) with all four corners in `nodes` (nr, nz)."""
     return np.asarray(nodes[:-1, :-1] & nodes[1:, :-1] & nodes[:-1, 1:] & nodes[1:, 1:])
-
-
-def _refined(values: FloatArray, parts: int, *, mirror: bool) -> FloatArray:
-    """Values (nr, nz, 4) on a grid `parts` times finer, by bicubic splines.
-
-    The axis is a mirror, as is z = 0 if `mirror`: the field across it is odd.
-    """
-    n = _SPLINE_MIRROR
-    odd_r, odd_z = np.ones(4), np.ones(4)
-    odd_r[E_R] = odd_z[E_Z] = -1
-    values = np.concatenate([values[n:0:-1] * odd_r, values])
-    below = n if mirror else 0
-    if mirror:
-        values = np.concatenate([values[:, n:0:-1] * odd_z, values], axis=1)
-    r, z = np.arange(values.shape[0]) - n, np.arange(values.shape[1]) - below
-    fine_r = np.arange(r[-1] * parts + 1) / parts
-    fine_z = np.arange(z[-1] * parts + 1) / parts
-    splines = [RectBivariateSpline(r, z, values[..., k], s=0) for k in range(4)]
-    return np.stack([spline(fine_r, fine_z) for spline in splines], axis=-1)
 
 
 def with_ghost_nodes(values: FloatArray, given: BoolArray) -> tuple[FloatArray, BoolArray]:

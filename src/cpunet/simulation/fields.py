@@ -16,9 +16,11 @@ is not depleted, and the potential is refused.
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 import os
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -30,10 +32,11 @@ from scipy.ndimage import binary_erosion, label, minimum_filter
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import written_aside
+from cpunet.progress import stage
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
 from cpunet.simulation.outline import DITCH, GERMANIUM, LI_CONTACT
-from cpunet.simulation.poisson import Grid, Potentials, make_grid, solve_potentials
+from cpunet.simulation.poisson import Grid, Potentials, make_grid, on_nodes, solve_potentials
 
 log = logging.getLogger(__name__)
 
@@ -106,24 +109,19 @@ def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
 SOLVER_VERSION = 4
 
 
-def cache_file(key: str) -> Path:
-    """Cache file of the potentials of a detector with the fingerprint `key`."""
-    folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
-    return Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
-
-
-# fields that do not affect the parts of the potential
-NOT_IN_PARTS = (
-    "name",
-    "temperature_K",
-    "bias_V",
-    "impurity_scale",
-    "impurity_tilt_1e10_per_cm4",
-    "measured_depletion_V",
-)
+# fields that do not affect the parts of the potential, and values in their place
+_NOT_IN_PARTS = {
+    "temperature_K": 90.0,
+    "bias_V": 1.0,
+    "impurity_scale": 1.0,
+    "impurity_tilt_1e10_per_cm4": 0.0,
+    "measured_depletion_V": 0.0,
+}
 
 _SCALE_RESOLUTION = 1e-5
 _LARGEST_SCALE = 1000.0
+# Maximum number of detector shapes (such as lithium thicknesses) whose potentials are held.
+_MAX_SHAPES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,52 +130,31 @@ class Superposition:
 
     Parameters
     ----------
-    detector
-        Detector as solved. Its bias is irrelevant, and its impurities are neither scaled nor
-        tilted.
     grid, potentials
-        Nodes, and the parts of the potential at them.
+        Nodes, and the parts of the potential at them, for impurities neither scaled nor tilted.
     unit_depletion_V
         Depletion voltage in V for an ``impurity_scale`` of 1; infinite above 20 kV.
     """
 
-    detector: Detector
     grid: Grid
     potentials: Potentials
     unit_depletion_V: float
 
-    def potential_V(
-        self, bias_V: float, impurity_scale: float = 1.0, impurity_tilt: float = 0.0
-    ) -> FloatArray:
+    def total_V(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
         r"""Potential (nr, nz) in V for a bias in V and scaled and tilted impurities.
 
         .. math:: V = b\, w + s\, u + t\, v + q
 
-        The tilt is in 1e10/cm4.
-
-        Raises
-        ------
-        CpunetError
-            If the detector is not depleted, so that the superposition does not hold.
+        The tilt is in 1e10/cm4. Where the detector is not depleted, this is not the true
+        potential.
         """
-        potential = self.total_V(bias_V, impurity_scale, impurity_tilt)
-        if has_pocket(potential, self.grid.region):
-            depletion = self.depletion_V(impurity_scale, impurity_tilt)
-            name = self.detector.name
-            if depletion == math.inf:
-                raise CpunetError(
-                    f"detector {name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
-                    "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
-                )
-            raise CpunetError(
-                f"detector {name}: bias_V = {bias_V:g} does not deplete it; "
-                f"give at least the depletion voltage, {np.ceil(depletion):.0f} V"
-            )
-        return potential
+        parts = self.potentials
+        total = bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
+        return total + impurity_tilt * parts.tilt if impurity_tilt else total
 
     def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
         """Smallest bias in V that depletes the detector; infinite if none up to 20 kV does."""
-        alone = not self.detector.surface_charge_1e10_per_cm2 and impurity_tilt == 0
+        alone = not self.potentials.surface.any() and impurity_tilt == 0
         if alone and math.isfinite(self.unit_depletion_V):
             # without another charge, all of V scales together
             depletion = impurity_scale * self.unit_depletion_V
@@ -188,44 +165,45 @@ class Superposition:
             self.grid.region,
         )
 
-    def total_V(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
-        """Sum of the parts in V, also where the detector is not depleted."""
-        parts = self.potentials
-        total = bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
-        return total + impurity_tilt * parts.tilt if impurity_tilt else total
-
 
 def solve(detector: Detector) -> Superposition:
-    """Solve for the parts of a detector's potential, or load them from the cache.
+    """Solve for the parts of a detector's potential, or load them.
 
     They are stored on disk (in ``$CPUNET_CACHE`` or the user's cache folder) and loaded if the
-    same detector was solved before, at any bias and any scale and tilt of its impurities.
+    same detector was solved before, at any bias and any scale and tilt of its impurities. The
+    last few are held in memory.
 
     Raises
     ------
     CpunetError
         If the grid is too fine.
     """
-    file = cache_file(detector.fingerprint(exclude=NOT_IN_PARTS))
-    unit = detector.model_copy(
-        update={"impurity_scale": 1.0, "impurity_tilt_1e10_per_cm4": 0.0}
-    )
+    folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
+    key = detector.fingerprint(exclude=("name", *_NOT_IN_PARTS))
+    file = Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
+    return solved(detector.model_copy(update=_NOT_IN_PARTS), file)
+
+
+@functools.lru_cache(_MAX_SHAPES)
+def solved(unit: Detector, file: Path) -> Superposition:
+    """Parts of the potential of a detector with unit impurities, see `solve`."""
     with suppress(CpunetError, LookupError):  # if damaged, solved again and overwritten
         arrays = read_arrays(file)
         stored: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in arrays.items()}
         grid = Grid(**{field.name: stored[field.name] for field in fields(Grid)})
         parts = {field.name: stored[field.name] for field in fields(Potentials)}
-        return Superposition(unit, grid, Potentials(**parts), stored["depletion_V"])
-    grid = make_grid(unit)
-    log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
-    potentials = solve_potentials(unit, grid)
-    fixed = potentials.impurities + potentials.surface
-    depletion = depletion_voltage(potentials.bias, fixed, grid.region)
+        return Superposition(grid, Potentials(**parts), stored["depletion_V"])
+    with stage(f"Fields of {unit.name or 'the detector'}"):
+        grid = make_grid(unit)
+        log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
+        potentials = solve_potentials(unit, grid)
+        fixed = potentials.impurities + potentials.surface
+        depletion = depletion_voltage(potentials.bias, fixed, grid.region)
     # atomically; a cache that cannot be written is ignored
     with suppress(CpunetError), written_aside(file) as aside:
         content = vars(grid) | vars(potentials) | {"depletion_V": depletion}
         np.savez(aside, allow_pickle=False, **content)
-    return Superposition(unit, grid, potentials, depletion)
+    return Superposition(grid, potentials, depletion)
 
 
 _V_PER_CM = 10.0  # of 1 V / mm
@@ -237,7 +215,7 @@ class FieldMaps:
 
     Maps have shape (nr, nz). The field is E = -grad V in V/cm. It is 0 in contacts and
     outside; on the walls of the ditch it is that of the germanium. `region` is
-    `Detector.region` at the nodes.
+    `Detector.region` at the nodes. `depletion` gives the depletion voltage in V.
     """
 
     r_mm: FloatArray
@@ -249,43 +227,40 @@ class FieldMaps:
     weighting_potential: FloatArray
     region: RegionArray
     capacitance_pF: float
-    depletion_V: float
+    depletion: Callable[[], float]
+
+    @functools.cached_property
+    def depletion_V(self) -> float:
+        """Smallest bias in V that depletes the detector.
+
+        With tilted impurities or a surface charge this takes longer than all maps.
+        """
+        return self.depletion()
 
 
 def compute_fields(detector: Detector) -> FieldMaps:
-    """Solve for the fields of a fully depleted detector, or load them from the cache.
+    """Superpose the fields of a fully depleted detector from the parts that `solve` gives.
 
     Raises
     ------
     CpunetError
         If the detector is not fully depleted, or the grid is too fine.
     """
-    return superposed_fields(solve(detector), detector)
-
-
-def superposed_fields(
-    solution: Superposition, detector: Detector, *, depletion: bool = True
-) -> FieldMaps:
-    """Fields of a detector from a solution for any bias, scale and tilt of its impurities.
-
-    Parameters
-    ----------
-    solution
-        Solution of the detector.
-    detector
-        Detector with the bias, the temperature and the impurities wanted.
-    depletion
-        Whether to determine ``depletion_V``; NaN otherwise. With tilted impurities or a
-        surface charge this takes longer than everything else.
-
-    Raises
-    ------
-    CpunetError
-        If the detector is not fully depleted.
-    """
-    grid, parts = solution.grid, solution.potentials
+    solution = solve(detector)
+    grid, parts, bias = solution.grid, solution.potentials, detector.bias_V
     impurities = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
-    potential = solution.potential_V(detector.bias_V, *impurities)
+    potential = solution.total_V(bias, *impurities)
+    depletion = functools.partial(solution.depletion_V, *impurities)
+    if has_pocket(potential, grid.region):
+        if depletion() == math.inf:
+            raise CpunetError(
+                f"detector {detector.name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
+                "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
+            )
+        raise CpunetError(
+            f"detector {detector.name}: bias_V = {bias:g} does not deplete it; "
+            f"give at least the depletion voltage, {np.ceil(depletion()):.0f} V"
+        )
     # without a charge or a plane below it, the field has no component normal to the face z = 0
     mirror = not (detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
     e_r, e_z = electric_field(potential, grid, mirror=mirror)
@@ -299,7 +274,7 @@ def superposed_fields(
         weighting_potential=parts.point_contact,
         region=grid.region,
         capacitance_pF=parts.capacitance_pF,
-        depletion_V=solution.depletion_V(*impurities) if depletion else np.nan,
+        depletion=depletion,
     )
 
 
@@ -321,25 +296,17 @@ def scaled_to_depletion(detector: Detector) -> Detector:
             "add it to the file, or give `settings` measured_depletion_V=VALUE"
         )
     solution, tilt = solve(detector), detector.impurity_tilt_1e10_per_cm4
-
-    def pocket(scale: float) -> bool:
-        return has_pocket(solution.total_V(measured, scale, tilt), solution.grid.region)
-
     low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
-    what = f"detector {detector.name}: {measured:g} V"
-    if pocket(low):
-        raise CpunetError(
-            f"{what} do not deplete it even with {low:g} of its impurities; correct "
-            "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
-        )
-    if not pocket(high):
-        raise CpunetError(
-            f"{what} deplete it even with {high:g} times its impurities; correct "
-            "measured_depletion_V or impurity_z0_1e10_per_cm3"
-        )
     while high / low > 1 + _SCALE_RESOLUTION:
         middle = math.sqrt(low * high)
-        low, high = (low, middle) if pocket(middle) else (middle, high)
+        pocket = has_pocket(solution.total_V(measured, middle, tilt), solution.grid.region)
+        low, high = (low, middle) if pocket else (middle, high)
+    if low == 1 / _LARGEST_SCALE or high == _LARGEST_SCALE:
+        raise CpunetError(
+            f"detector {detector.name}: between {1 / _LARGEST_SCALE:g} and {_LARGEST_SCALE:g} "
+            f"times its impurities none depletes at {measured:g} V; correct "
+            "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
+        )
     log.info(
         f"{detector.name}: impurities times {low:.4g}, so that it depletes at the measured "
         f"{measured:g} V"
@@ -379,28 +346,27 @@ def electric_field(
     >>> bool((e_r == 0).all()), e_z[1].tolist()
     (True, [-1000.0, -1000.0, -1000.0, -1000.0])
     """
-    e_r = -_V_PER_CM * _slope(potential, grid.r_steps * grid.step_mm, grid.region)
-    e_z = -_V_PER_CM * _slope(potential.T, grid.z_steps.T * grid.step_mm, grid.region.T).T
+    components = []
+    for volts, steps, region in (
+        (potential, grid.r_steps, grid.region),
+        (potential.T, grid.z_steps.T, grid.region.T),
+    ):
+        # the parabola through a node and its neighbours; across a wall of the ditch the slope
+        # jumps: only the germanium side counts
+        ditch = region == DITCH
+        rise = np.diff(volts, axis=0) / (steps * grid.step_mm)
+        weight = np.where(ditch[:-1] & ditch[1:], 1e-9, 1.0) / (steps * grid.step_mm)
+        slope = on_nodes(weight * rise, weight * rise, axis=0) / on_nodes(
+            weight, weight, axis=0
+        )
+        components.append(-_V_PER_CM * slope)
+    e_r, e_z = components[0], components[1].T
     e_r[0] = 0
     if mirror:
         e_z[:, 0] = 0
     contact = grid.region <= LI_CONTACT
     e_r[contact] = e_z[contact] = 0
     return e_r, e_z
-
-
-def _slope(potential: FloatArray, steps: FloatArray, region: RegionArray) -> FloatArray:
-    """Derivative along the first axis of the parabola through a node and its neighbours."""
-    # across a wall of the ditch the slope jumps: only the germanium side counts
-    ditch = region == DITCH
-    vacuum = ditch[:-1] & ditch[1:]
-    rise = np.diff(potential, axis=0) / steps
-    weight = np.where(vacuum, 1e-9, 1.0) / steps
-    slope, total = np.zeros_like(potential), np.zeros_like(potential)
-    for nodes in (slice(None, -1), slice(1, None)):
-        slope[nodes] += weight * rise
-        total[nodes] += weight
-    return slope / total
 
 
 def fields_in_words(detector: Detector, fields: FieldMaps) -> list[tuple[str, str]]:

@@ -236,12 +236,8 @@ class Detector(Config):
         radial = (r / self.crystal_radius) ** self.impurity_radial_power
         scaled = axial * (1 + (self.impurity_radial_mult - 1) * radial)
         total = scaled + self.impurity_radial_add_1e10_per_cm3 * radial
-        tilt = self.impurity_tilt_1e10_per_cm4 * self.per_tilt_cm(z)
+        tilt = self.impurity_tilt_1e10_per_cm4 * ((z - self.crystal_length / 2) / 10)
         return np.asarray(self.impurity_scale * total + tilt)
-
-    def per_tilt_cm(self, z: npt.ArrayLike) -> FloatArray:
-        """Profile of a unit tilt at `z` in mm: z - L/2 in cm."""
-        return (np.asarray(z, float) - self.crystal_length / 2) / 10
 
     def inside(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Whether `r`, `z` (mm) lie in germanium, including lithium layer and surfaces.
@@ -252,9 +248,9 @@ class Detector(Config):
         >>> read_detector("icpc").inside([0, 0, 12, 40], [10, 90, 1, 50])
         array([ True, False, False,  True])
         """
-        from cpunet.simulation import outline  # compiled, which few users of a detector need
+        from cpunet.simulation.outline import places  # compiled, which few users need
 
-        return outline.at(outline.fill_insides, np.bool_, self, r, z)
+        return places(self, r, z)[1]
 
     def active(self, r: npt.ArrayLike, z: npt.ArrayLike) -> BoolArray:
         """Whether `r`, `z` (mm) lie in germanium with a field: no contact, no ditch.
@@ -274,9 +270,9 @@ class Detector(Config):
 
         Surfaces belong to the contacts and to the ditch.
         """
-        from cpunet.simulation import outline
+        from cpunet.simulation.outline import places
 
-        return outline.at(outline.fill_regions, np.int8, self, r, z)
+        return places(self, r, z)[0]
 
     def fingerprint(self, exclude: Iterable[str] = ("name",)) -> str:
         """Hash of all values except those in `exclude`. Equal detectors have equal hashes."""

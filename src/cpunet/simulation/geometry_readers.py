@@ -4,50 +4,32 @@ from __future__ import annotations
 
 import logging
 import math
+import re
 from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
 from cpunet.settings import Set, checked, key_values, names, read_text, read_values
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.legend_metadata import (
-    LIQUID_ARGON_K,
-    detector_values,
-    impurity_values,
-    value_at,
-)
+from cpunet.simulation.legend_metadata import detector_values
 
 log = logging.getLogger(__name__)
 
 _FOLDER = Path(__file__).parent / "detectors"
 _MAPPINGS = (".yaml", ".yml", ".json")
+LIQUID_ARGON_K = 87.0  # around LEGEND's detectors, whose metadata tell no temperature
 _SIGGEN_BYTES = 1 << 16
 
-_SIGGEN_FIELDS = {
-    "xtal_length": "crystal_length",
-    "xtal_radius": "crystal_radius",
-    "top_bullet_radius": "top_bullet_radius",
-    "bottom_bullet_radius": "bottom_bullet_radius",
-    "pc_length": "point_contact_length",
-    "pc_radius": "point_contact_radius",
-    "bottom_taper_length": "bottom_taper_length",
-    "wrap_around_radius": "wrap_around_radius",
-    "ditch_depth": "ditch_depth",
-    "ditch_thickness": "ditch_thickness",
-    "hole_length": "bore_length",
-    "hole_radius": "bore_radius",
-    "hole_bullet_radius": "bore_bullet_radius",
-    "outer_taper_length": "outer_taper_length",
-    "inner_taper_length": "inner_taper_length",
+# siggen's names of fields of the detector; parts of the names, then whole names
+_SIGGEN_PARTS = (("xtal_", "crystal_"), ("pc_", "point_contact_"), ("hole_", "bore_"))
+_SIGGEN_NAMES = {
     "taper_angle": "taper_angle_deg",
     "Li_thickness": "li_thickness",
-    "vacuum_gap": "vacuum_gap",
     "impurity_z0": "impurity_z0_1e10_per_cm3",
     "impurity_gradient": "impurity_gradient_1e10_per_cm4",
     "impurity_quadratic": "impurity_quadratic_1e10_per_cm3",
     "impurity_surface": "surface_charge_1e10_per_cm2",
     "impurity_radial_add": "impurity_radial_add_1e10_per_cm3",
-    "impurity_radial_mult": "impurity_radial_mult",
     "impurity_rpower": "impurity_radial_power",
     "xtal_HV": "bias_V",
     "xtal_temp": "temperature_K",
@@ -59,23 +41,10 @@ _DERIVED = ("hole_length_gap", "outer_taper_width", "inner_taper_width", "bullet
 _OFFSETS = ("pc_offset_", "hole_offset_")
 _LEAST_POWER = 0.1
 # settings of the drift, and names of the program's files
-_NOT_OF_THE_DETECTOR = (
-    "drift_name",
-    "field_name",
-    "wp_name",
-    "preamp_tau",
-    "time_steps_calc",
-    "step_time_calc",
-    "step_time_out",
-    "charge_cloud_size",
-    "use_diffusion",
-    "energy",
-    "verbosity",
-    "verbosity_level",
-    "max_iterations",
-    "write_field",
-    "write_WP",
-    "surface_drift_vel_factor",
+_NOT_OF_THE_DETECTOR = re.compile(
+    "(drift|field|wp)_name|preamp_tau|time_steps_calc|step_time_(calc|out)|charge_cloud_size|"
+    "use_diffusion|energy|verbosity(_level)?|max_iterations|write_(field|WP)|"
+    "surface_drift_vel_factor"
 )
 
 
@@ -115,15 +84,16 @@ def read_detector(path: str | Path | Detector, overrides: Set = ()) -> Detector:
     values: dict[str, Any]
     hints: dict[str, str] = {}
     if isinstance(path, Detector):
-        if not given:
-            return path
         name, values = path.name, path.model_dump()
     elif name in detector_names() or Path(path).suffix.lower() in _MAPPINGS:
         values = {"name": Path(name).stem} | read_values(path, _FOLDER)
     else:
         values = {"name": Path(name).stem} | siggen_values(read_text(path, _FOLDER), name)
     if "geometry" in values:
-        values, hints = _legend(values, name, argon="temperature_K" not in given)
+        values, hints = detector_values(values, name)
+        if "temperature_K" not in given:
+            values["temperature_K"] = LIQUID_ARGON_K
+            log.info(f"{name}: tells no temperature; {LIQUID_ARGON_K:g} K, as in liquid argon")
     values |= given
     by_depletion = values.get("impurity_scale") == "depletion"
     if by_depletion:
@@ -150,38 +120,6 @@ def holds_detector(path: str | Path) -> bool:
         return b"xtal_length" in file.read(_SIGGEN_BYTES)
 
 
-def _legend(
-    diode: dict[str, Any], name: str, *, argon: bool
-) -> tuple[dict[str, Any], dict[str, str]]:
-    """Fields of a LEGEND diode and its crystal, and why it does not give some others.
-
-    `argon` is whether it is at the temperature of liquid argon.
-    """
-    path = Path(name)
-    values, hints = detector_values(diode, name)
-    if argon:
-        values["temperature_K"] = LIQUID_ARGON_K
-        log.info(f"{name}: tells no temperature; {LIQUID_ARGON_K:g} K, as in liquid argon")
-    boule, cut = values["name"][:-1], values["name"][-1:]  # V99000 and A of V99000A
-    slice_name = value_at(diode, "production.slice", f"detector {name}")
-    places = [
-        folder / f"{boule}{suffix}"
-        for folder in (path.parent.parent / "crystals", path.parent / "crystals", path.parent)
-        for suffix in _MAPPINGS
-    ]
-    crystal = next(filter(Path.is_file, places), None)
-    content = read_values(crystal) if crystal else {}
-    length = values.get("crystal_length")
-    if content.get("impurity_curve") is None:
-        hints["impurity_z0_1e10_per_cm3"] = (
-            f"{crystal} has no impurity_curve" if crystal else f"there is no {places[0]}"
-        )
-    elif isinstance(length, int | float):  # else refused with the rest of the geometry
-        slice_name = cut if slice_name is None else str(slice_name)
-        values |= impurity_values(content, str(crystal), slice_name, length)
-    return values, hints
-
-
 def siggen_values(text: str, name: str) -> dict[str, float]:
     r"""Fields of `Detector` from the content `text` of siggen's configuration file `name`.
 
@@ -202,11 +140,11 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
     values: dict[str, float] = {}
     for number, line in enumerate(text.splitlines(), 1):
         words = line.split("#")[0].split()
-        if not words or line[0] in " \t" or words[0] in _NOT_OF_THE_DETECTOR:
+        if not words or line[0] in " \t" or _NOT_OF_THE_DETECTOR.fullmatch(words[0]):
             continue
         where, key = f"detector {name}: line {number}: {words[0]}", words[0]
         key = {"taper_length": "bottom_taper_length"}.get(key, key).replace("_diam", "_radius")
-        if key not in (*_SIGGEN_FIELDS, *_DERIVED) and not key.startswith(_OFFSETS):
+        if not (_field_of(key) or key in _DERIVED or key.startswith(_OFFSETS)):
             raise CpunetError(f"{where}: unknown key; neither siggen nor fieldgen has it")
         try:
             values[key] = float(words[1]) / (2 if words[0].endswith("_diam") else 1)
@@ -223,9 +161,7 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
             f"detector {name}: rounded point contacts are not simulated; set bulletize_PC to 0"
         )
     _fit(values, name)
-    fields = {
-        _SIGGEN_FIELDS[key]: value for key, value in values.items() if key in _SIGGEN_FIELDS
-    }
+    fields = {field: value for key, value in values.items() if (field := _field_of(key))}
     for side, angle in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
         width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
         own_angle = math.degrees(math.atan(width / length)) if length else math.nan
@@ -238,6 +174,14 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
     if not values.get("impurity_rpower", 0.0) > _LEAST_POWER:
         fields = {k: v for k, v in fields.items() if not k.startswith("impurity_radial")}
     return fields
+
+
+def _field_of(key: str) -> str:
+    """Field of `Detector` of a key of siggen, ``""`` if there is none."""
+    field = _SIGGEN_NAMES.get(key, key)
+    for theirs, ours in _SIGGEN_PARTS:
+        field = field.replace(theirs, ours)
+    return field if field in Detector.model_fields else ""
 
 
 def _fit(values: dict[str, float], name: str) -> None:

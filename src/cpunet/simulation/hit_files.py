@@ -1,38 +1,63 @@
-"""Hits of a detector from files of all formats, and what is in such a file."""
+"""Hits of a detector from files of all formats, and what is in such a file.
+
+These are tables of steps of remage, Geant4 and g4simple, archives, and our own.
+"""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from contextlib import suppress
+import re
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import item_at, members, opened, units_of
 from cpunet.pulses.peaks import label_peaks
+from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.pulses.reading.columns import divides, dividing, labels, texts, whole_numbers
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.hit_tables import hit_format, step_tables
-from cpunet.simulation.hits import (
-    FARTHEST_MM,
-    LATE_NS,
-    MAX_KEV,
-    WINDOW_US,
-    FloatArray,
-    HitOptions,
-    Hits,
-    IntArray,
-)
+from cpunet.simulation.hits import FloatArray, HitOptions, Hits, IntArray
 from cpunet.tables import Lines, counted, span
+from cpunet.units import factor, unit_names
 
 log = logging.getLogger(__name__)
 
+# Larger than any laboratory and any event.
+FARTHEST_MM, MAX_KEV = 1e7, 1e9
+# Deposits of an event number that come later are another event, as in remage.
+WINDOW_US = 10.0
+# Deposits of an event are simulated at once; later ones would change the edge of its pulse.
+LATE_NS = 50.0
 # Numbers in a row that rise, on average, in files of jobs
 _LONG_RISE = 3
 # the largest deposit of any source is above the first, the median event below the second
 _LEAST_KEV, _MOST_KEV = 5.0, 1e5
+HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
+NTUPLES, STEPS = "default_ntuples", "stp"
+_G4SIMPLE, _G4SIMPLE_TITLE, _G4SIMPLE_UNITS = "g4sntuple", "steps data", "mm,MeV"
+_CSV_MAGIC = b"#class tools::wcsv::ntuple"
+# what a column is, and its names in small letters: the first of these is read
+_NAMES = {
+    "event": ("evtid", "event", "event#", "eventid", "event_id", "event_number"),
+    "x": ("xloc", "x"),
+    "y": ("yloc", "y"),
+    "z": ("zloc", "z"),
+    "edep": ("edep", "energydeposit"),
+    "time": ("time", "t", "globaltime", "t0"),
+}
+_NEEDED = ("event", "x", "y", "z", "edep")
+_VECTORS = ("cumulative_length", "flattened_data")
+_WITH_UNIT = re.compile(r"(.+?)\s*(?:\[(.*)\]|_in_(.+))$")
+# arrays of an NPZ, and the columns that they are
+_ARRAYS = {f"{axis}_mm": f"{axis}_in_mm" for axis in "xyz"} | {"edep_keV": "edep_in_keV"}
 
 
 def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
@@ -78,19 +103,7 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
             )
         if chosen is not None and chosen not in detectors:
             raise CpunetError(f"{file}: no detector {chosen}; it holds {names}")
-        table = detectors[chosen or next(iter(detectors))]
-        steps, origin = table.steps(options.units), table.origin_mm()
-    hits = _to_hits(file, steps, origin, options)
-    energy_kev = hits.energy_kev
-    if not len(hits):
-        raise CpunetError(f"{file}: no step deposits energy; check the detector's name")
-    if energy_kev.max() < _LEAST_KEV or np.median(energy_kev) > _MOST_KEV:
-        raise CpunetError(
-            f"{file}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
-            "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
-            "give `units` if it names none"
-        )
-    return hits
+        return _hits_of(detectors[chosen or next(iter(detectors))], options)
 
 
 def holds_hits(path: Path | str) -> bool:
@@ -103,9 +116,7 @@ def holds_hits(path: Path | str) -> bool:
     return False
 
 
-def _to_hits(
-    path: Path, steps: dict[str, npt.NDArray[Any]], origin_mm: FloatArray, options: HitOptions
-) -> Hits:
+def _hits_of(table: StepTable, options: HitOptions) -> Hits:
     """Group steps with a deposit by event (see `first_of_event`), in the order of the file.
 
     Positions are moved to the frame of the crystal. An event whose number an earlier one has
@@ -114,11 +125,16 @@ def _to_hits(
     Raises
     ------
     CpunetError
-        If a step has no finite position, time or energy, or a negative energy.
+        If a step has no finite position, time or energy, or a negative energy; if a hit is far
+        away, none is left, or energies are of another unit.
     """
-    position = np.stack([steps[axis] for axis in "xyz"], axis=1) - origin_mm
+    path, steps = table.path, table.steps(options.units)
     event, edep = steps["event"], steps["edep"]
     time = steps.get("time", np.zeros(len(event)))
+    # from the frame of the file to that of the crystal
+    mirror = np.array([1.0, -1.0, -1.0]) if options.flip_z else np.ones(3)
+    position = np.stack([steps[axis] for axis in "xyz"], axis=1)
+    position = (position - np.asarray(options.origin)) * mirror
     # written so that NaN fails
     placed = (np.abs(position) <= FARTHEST_MM).all(axis=1) & np.isfinite(time)
     bad = ~(placed & (edep >= 0) & (edep <= MAX_KEV))
@@ -126,12 +142,13 @@ def _to_hits(
         raise CpunetError(
             f"{path}: event {event[np.argmax(bad)]}: a step has no finite position or time, or "
             f"no energy of at least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km away or have "
-            f"{MAX_KEV / 1e9:g} TeV); remove the event or simulate again"
+            f"{MAX_KEV / 1e9:g} TeV); check the units and the origin, or remove the event"
         )
-    positive = edep > 0
-    largest = event.max(initial=-1)
-    event, edep = event[positive], edep[positive]
-    position, time = position[positive], time[positive]
+    positive, largest = edep > 0, event.max(initial=-1)
+    if not positive.any():
+        raise CpunetError(f"{path}: no step deposits energy; check the detector's name")
+    position, edep = position[positive], edep[positive]
+    event, time = event[positive], time[positive]
     first = first_of_event(event, time)
     # steps of one event need not be adjacent, as in files merged from several threads
     order = np.argsort(first, kind="stable")
@@ -140,23 +157,21 @@ def _to_hits(
     again = np.ones(len(numbers), bool)
     again[np.unique(numbers, return_index=True)[1]] = False
     numbers[again] = largest + 1 + np.arange(again.sum())
-    # from the frame of the file to that of the crystal
-    mirror = np.array([1.0, -1.0, -1.0]) if options.flip_z else np.ones(3)
-    hits = Hits.of(
-        (position[order] - np.asarray(options.origin)) * mirror,
-        edep[order],
-        np.concatenate([[0], np.cumsum(counts)]),
-        numbers,
-    )
-    if len(hits):
-        times, begins = time[order], hits.offsets[:-1]
-        spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
-        if late := int((spread > LATE_NS).sum()):
-            log.warning(
-                f"{path}: {late} events have deposits more than {LATE_NS:g} ns after their "
-                "first, simulated as if at once; if these are other events, give them numbers "
-                "of their own"
-            )
+    offsets = np.concatenate([[0], np.cumsum(counts)])
+    hits = Hits.of(position[order], edep[order], offsets, numbers)
+    times, begins, energy_kev = time[order], offsets[:-1], hits.energy_kev
+    spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
+    if late := int((spread > LATE_NS).sum()):
+        log.warning(
+            f"{path}: {late} events have deposits more than {LATE_NS:g} ns after their first, "
+            "simulated as if at once; if these are other events, give them numbers of their own"
+        )
+    if energy_kev.max() < _LEAST_KEV or np.median(energy_kev) > _MOST_KEV:
+        raise CpunetError(
+            f"{path}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
+            "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
+            "give `units` if it names none"
+        )
     return hits
 
 
@@ -173,7 +188,21 @@ def first_of_event(number: IntArray, time_ns: FloatArray) -> IntArray:
     >>> first_of_event(np.array([0, 1, 2, 0, 1, 2]), np.zeros(6))
     array([0, 1, 2, 3, 4, 5])
     """
-    job = _job_of_step(number)
+    # Numbers of a job rise. An event that a thread wrote in two blocks ends one such rise and
+    # begins another; where more come back otherwise, the numbering has started anew. Rows in
+    # another order, as that of time, rise and fall all the time (by two on average).
+    starts = np.flatnonzero(np.append(True, np.diff(number) != 0)[: len(number)])
+    runs = number[starts]
+    falls = np.diff(runs) < 0
+    begins, ends = np.append(True, falls), np.append(falls, True)
+    order = np.argsort(runs, kind="stable")
+    again = np.diff(runs[order]) == 0
+    again &= ~(ends[order[:-1]] & begins[order[1:]])
+    job_of_run = np.zeros(len(runs), np.int64)
+    if again.sum() > 1 and len(runs) >= _LONG_RISE * begins.sum():
+        job_of_run[order[1:]] = np.cumsum(again)
+    job = np.repeat(job_of_run, np.diff(np.append(starts, len(number))))
+
     order = np.lexsort((time_ns, job, number))
     new = (np.diff(number[order]) != 0) | (np.diff(job[order]) != 0)
     new |= np.diff(time_ns[order]) > 1000 * WINDOW_US
@@ -182,26 +211,6 @@ def first_of_event(number: IntArray, time_ns: FloatArray) -> IntArray:
     counts = np.diff(np.append(starts, len(number)))
     first[order] = np.repeat(np.minimum.reduceat(order, starts), counts)
     return first
-
-
-def _job_of_step(number: IntArray) -> IntArray:
-    """Index of the job of each step among those with its number.
-
-    The numbers of a job rise. An event that a thread wrote in two blocks ends one such rise and
-    begins another; where more come back otherwise, the numbering has started anew. Rows in
-    another order, as that of time, rise and fall all the time (by two on average).
-    """
-    starts = np.flatnonzero(np.append(True, np.diff(number) != 0)[: len(number)])
-    runs = number[starts]
-    falls = np.diff(runs) < 0
-    begins, ends = np.append(True, falls), np.append(falls, True)
-    order = np.argsort(runs, kind="stable")
-    again = np.diff(runs[order]) == 0
-    again &= ~(ends[order[:-1]] & begins[order[1:]])
-    job = np.zeros(len(runs), np.int64)
-    if again.sum() > 1 and len(runs) >= _LONG_RISE * begins.sum():
-        job[order[1:]] = np.cumsum(again)
-    return np.repeat(job, np.diff(np.append(starts, len(number))))
 
 
 def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
@@ -244,13 +253,13 @@ def describe_hits(
     """
     detectors: dict[str, Lines] = {}
     with step_tables(path) as tables:
-        names = [*tables]
-    for name in names:
-        try:
-            hits = read_hits(path, HitOptions(name or None, units=units))
-        except CpunetError as error:
-            detectors[name] = [("hits", str(error).removeprefix(f"{path}: "))]
-            continue
+        hits_of: dict[str, Hits] = {}
+        for name, table in tables.items():
+            try:
+                hits_of[name] = _hits_of(table, HitOptions(units=units))
+            except CpunetError as error:
+                detectors[name] = [("hits", str(error).removeprefix(f"{path}: "))]
+    for name, hits in hits_of.items():
         lines = label_peaks(hits.energy_kev, peaks)
         places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
         extents = (
@@ -263,3 +272,249 @@ def describe_hits(
             ("extents", f"{', '.join(extents)} mm"),
         ]
     return detectors
+
+
+@dataclass(frozen=True)
+class StepTable:
+    """Steps of a detector: columns by name, arrays or items of an open HDF5 file.
+
+    Those of HDF5 are arrays with a value per row, or vectors with a value per step of the row;
+    the vectors of deposits give the steps of each row. The `name` is that of the detector,
+    empty without any. `units` are those of columns that name none: MeV and mm in tables of
+    g4simple. A `file` of remage tells where its detectors are. Where detectors share the table,
+    `labels` are those of the steps, and those with the name are read.
+    """
+
+    path: Path
+    columns: Mapping[str, Any]
+    name: str = ""
+    units: str = ""
+    file: h5py.File | None = None
+    labels: npt.NDArray[np.str_] | None = None
+
+    def by_detector(self) -> dict[str, StepTable]:
+        """The table, or its parts by the labels of their detectors where several share it.
+
+        Labels without deposits are the world or a holder.
+        """
+        of = roles(self.columns)
+        if missing := [role for role in _NEEDED if role not in of]:
+            raise CpunetError(
+                f"{self.path}: no column for {missing[0]}; "
+                f"the file holds {', '.join(self.columns)}"
+            )
+        deposits = self._read(of["edep"][0])[0] > 0
+        dividers = {name: self._read(name)[0] for name in self.columns if divides(name)}
+        some = {name: values[deposits] for name, values in dividers.items()}
+        names = dividing(some, int(deposits.sum())) or list(dividers)[:1]
+        if not names:
+            return {self.name: self}
+        of_steps = texts(dividers[names[0]]) if len(names) == 1 else labels(dividers, names)
+        detectors = sorted(map(str, np.unique(of_steps[deposits])), key=lambda x: (len(x), x))
+        if len(detectors) > 1 or (detectors and not self.name):
+            return {label: replace(self, name=label, labels=of_steps) for label in detectors}
+        return {self.name: self}
+
+    def steps(self, units: str) -> dict[str, npt.NDArray[Any]]:
+        """Steps, events in any order; `units` are those of `HitOptions`.
+
+        Returns
+        -------
+        dict
+            ``event`` numbers, ``x``, ``y``, ``z`` (mm) from the origin of the detector, or of
+            the file if it tells none, ``edep`` (keV) and, if the file has them, ``time`` (ns).
+
+        Raises
+        ------
+        CpunetError
+            If a column is no number or names no known unit.
+        """
+        chosen = slice(None) if self.labels is None else self.labels == self.name
+        steps: dict[str, npt.NDArray[Any]] = {}
+        for role, (name, in_name) in roles(self.columns).items():
+            values, unit = self._read(name)
+            where = f"{self.path}: column {name}"
+            if values.ndim != 1 or values.dtype.kind not in "iuf":
+                raise CpunetError(
+                    f"{where} is of {values.dtype} and shape {values.shape}; give one number "
+                    "per step (g4simple: its option for steps)"
+                )
+            if role == "event":
+                values = whole_numbers(values, where)
+            else:
+                given = unit or in_name, *re.split(r"[\s,]+", units), *self.units.split(",")
+                values = values * _unit_factor(role, where, given)
+            steps[role] = values[chosen]
+            origin = f"detector_origins/{self.name}/{role}loc"
+            if self.file is not None and origin in self.file:
+                # it may lack a unit; all lengths of remage are in m
+                item, where = self.file[origin], f"{self.path}: column {origin}"
+                to_mm = _unit_factor(role, where, (units_of(item), "m"))
+                steps[role] = steps[role] - item[()].item() * to_mm
+        return steps
+
+    def _read(self, name: str) -> tuple[npt.NDArray[Any], str]:
+        """Values of a column for all steps, and the unit that belongs to them."""
+        item, edep = self.columns[name], self.columns[roles(self.columns)["edep"][0]]
+        where, vectors = f"{self.path}: column", _has(item, *_VECTORS)
+        if not vectors and not (isinstance(item, h5py.Dataset | np.ndarray) and item.ndim == 1):
+            raise CpunetError(f"{where} {name} is no array with a value per step or hit")
+        # each row ends with one of the steps
+        ends, of_edep = (
+            column["cumulative_length"][()].astype(np.int64)
+            if _has(column, *_VECTORS)
+            else np.arange(len(column)) + 1
+            for column in (item, edep)
+        )
+        if len(ends) != len(of_edep) or (vectors and not np.array_equal(ends, of_edep)):
+            raise CpunetError(f"{where}s {name} and edep differ in length; truncated?")
+        if isinstance(item, np.ndarray):
+            return item, ""
+        if not vectors:
+            return np.repeat(item[()], np.diff(of_edep, prepend=0)), units_of(item)
+        flat = item["flattened_data"]
+        return np.asarray(flat[: ends.max(initial=0)]), units_of(flat) or units_of(item)
+
+
+def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """What the columns of these `names` are: role → (name, unit in the name or ``""``).
+
+    Examples
+    --------
+    >>> roles(["evtid", "edep_in_keV", "X [mm]"])
+    {'event': ('evtid', ''), 'x': ('X [mm]', 'mm'), 'edep': ('edep_in_keV', 'keV')}
+    """
+    plain: dict[str, tuple[str, str]] = {}
+    for name in names:
+        match = _WITH_UNIT.match(name)
+        base, unit = (match[1], (match[2] or match[3] or "").strip()) if match else (name, "")
+        plain.setdefault(base.lower(), (name, unit))
+    return {
+        role: plain[next(filter(plain.__contains__, spellings))]
+        for role, spellings in _NAMES.items()
+        if not plain.keys().isdisjoint(spellings)
+    }
+
+
+def _unit_factor(role: str, where: str, units: Iterable[str]) -> float:
+    """Conversion factor of a column to keV, ns or mm.
+
+    `role` is ``"edep"``, ``"time"`` or an axis. The first of the `units` is that of the column,
+    ``""`` if it names none: then it is the first of the others that is of its kind. Times
+    without a unit are in ns, Geant4's own.
+
+    Raises
+    ------
+    CpunetError
+        If the unit is unknown, or nobody tells it.
+    """
+    to = {"edep": "keV", "time": "ns"}.get(role, "mm")
+    named, *others = units
+    given = [unit for unit in (*others, "ns") if factor(unit, to)]
+    if not (unit := named or next(iter(given), "")):
+        raise CpunetError(f"{where} names no unit; give `units`, one of {unit_names(to)}")
+    if (to_ours := factor(unit, to)) is None:
+        raise CpunetError(f"{where} is in {unit!r}; expected one of {unit_names(to)}")
+    return to_ours
+
+
+def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
+    """Format of a file of hits by its content; `stored` are hits with their pulses."""
+    if h5py.is_hdf5(path):
+        with opened(path) as file:
+            if any(isinstance(file.get(folder), h5py.Group) for folder in (STEPS, NTUPLES)):
+                return "tables"
+            return "stored" if HIT_TABLE in file else ""
+    if zipfile.is_zipfile(path):
+        with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+            return "npz" if {"x_mm.npy", "offsets.npy"} <= {*archive.namelist()} else ""
+    try:
+        with path.open("rb") as stream:
+            return "csv" if stream.read(len(_CSV_MAGIC)) == _CSV_MAGIC else ""
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+@contextmanager
+def step_tables(path: Path) -> Iterator[dict[str, StepTable]]:
+    """Open a file of hits; its tables, by detector, can be read until it is closed.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, is of no known format or has no table of steps.
+    """
+    kind = hit_format(path)
+    if kind in ("csv", "npz"):
+        yield (_csv_table if kind == "csv" else _npz_table)(path).by_detector()
+        return
+    if not kind:
+        raise CpunetError(
+            f"{path}: no format of hits; expected LH5 or HDF5 with {STEPS} (remage), "
+            f"{NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
+        )
+    with opened(path) as file:
+        groups = {"": file[HIT_TABLE]} if kind == "stored" else {}
+        for folder in (STEPS, NTUPLES):
+            if kind == "tables" and (held := item_at(file, folder)) is not None:
+                groups |= members(held)
+        tables: dict[str, StepTable] = {}
+        for name, group in groups.items():
+            if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys():
+                # the values of a column of Geant4's HDF5 are its pages
+                columns = {
+                    key: item["pages"] if _has(item, "pages") else item
+                    for key, item in members(group).items()
+                }
+                # g4simple writes one table for all detectors
+                of = ("", _G4SIMPLE_UNITS) if name == _G4SIMPLE else (name, "")
+                tables |= StepTable(path, columns, *of, file).by_detector()
+        if not tables:
+            raise CpunetError(
+                f"{path}: no table of {STEPS} or {NTUPLES} has columns for "
+                f"{', '.join(_NEEDED)}; simulate again and write all steps"
+            )
+        yield tables
+
+
+def _has(item: Any, *parts: str) -> bool:
+    return isinstance(item, h5py.Group) and all(part in item for part in parts)
+
+
+def _npz_table(path: Path) -> StepTable:
+    """Arrays with a value per hit. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
+    arrays = read_arrays(path)
+    needed = [*_ARRAYS, "offsets"]
+    if missing := [name for name in needed if name not in arrays]:
+        raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(needed)}")
+    offsets = whole_numbers(arrays["offsets"], f"{path}: offsets")
+    counts = np.diff(offsets)
+    if offsets[:1].any() or np.any(counts < 0):
+        raise CpunetError(f"{path}: offsets do not divide the hits into events")
+    columns = {column: arrays[name] for name, column in _ARRAYS.items()}
+    return StepTable(path, columns | {"event": np.repeat(np.arange(len(counts)), counts)})
+
+
+def _csv_table(path: Path) -> StepTable:
+    """A CSV ntuple of Geant4, or several in one file; g4simple's is recognised by its title."""
+    from pandas import read_csv  # half a second, which other formats do not need
+
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        headers = {n: line for n, line in enumerate(lines) if line.startswith("#")}
+    first = (line for i, (n, line) in enumerate(headers.items()) if i == n)
+    header = [line[1:].strip().partition(" ")[::2] for line in first]
+    names = [value.partition(" ")[2] for key, value in header if key == "column"]
+    about = {"title": "", "separator": str(ord(","))} | dict(header)
+    how: dict[str, Any] = {"sep": chr(int(about["separator"])), "encoding_errors": "replace"}
+    try:
+        # the columns of one file can be numbers, text or both
+        cells = read_csv(path, header=None, skiprows=[*headers], low_memory=False, **how)
+    except ValueError as error:
+        raise CpunetError(f"{path}: holds no steps ({error}); export again") from error
+    if (n := cells.shape[1]) != len(names):
+        raise CpunetError(f"{path}: {n} values a line for {len(names)} columns; export again")
+    if cells[n - 1].isna().any():
+        raise CpunetError(f"{path}: a line is not {n} values; is it cut off?")
+    columns = {name: cells[at].to_numpy() for at, name in enumerate(names)}
+    g4simple = about["title"] == _G4SIMPLE_TITLE
+    return StepTable(path, columns, units=_G4SIMPLE_UNITS if g4simple else "")

@@ -6,7 +6,7 @@ import logging
 import re
 from collections import deque
 from collections.abc import Iterator, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -19,8 +19,8 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_files import read_hits
-from cpunet.simulation.hits import WINDOW_US, HitOptions, Hits, OpenHits
+from cpunet.simulation.hit_files import WINDOW_US, read_hits
+from cpunet.simulation.hits import HitOptions, Hits, OpenHits
 
 log = logging.getLogger(__name__)
 
@@ -224,31 +224,29 @@ class GammaSource:
         Each round has its own seed, so the events do not depend on the number of cores.
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
-        workers = min(usable_cores(), _MAX_WORKERS, rounds)
-        waiting: deque[Future[tuple[Hits, int]]] = deque()
-        pool = ThreadPoolExecutor(workers)
-        primaries = 0
+
+        def events_of(i: int) -> tuple[Hits, int]:
+            wanted = {
+                w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()
+            }
+            return simulate_gammas(
+                detector,
+                source_height_mm=self.height_mm,
+                source_radius_mm=self.radius_mm,
+                n_primaries=_GAMMAS_PER_EVENT * sum(wanted.values()),
+                seed=int(seeds[i]),
+                wanted=wanted,
+            )
+
+        ahead = min(usable_cores(), _MAX_WORKERS, rounds)
+        pool, primaries = ThreadPoolExecutor(ahead), 0
+        waiting = deque(pool.submit(events_of, i) for i in range(ahead))
         try:
-            for i in range(rounds + workers):
-                if i < rounds:
-                    waiting.append(pool.submit(self._round, detector, i, rounds, int(seeds[i])))
-                if i >= workers:
-                    hits, n_primaries = waiting.popleft().result()
-                    yield replace(hits, event_number=hits.event_number + primaries)
-                    primaries += n_primaries
+            for later in range(ahead, rounds + ahead):
+                hits, n_primaries = waiting.popleft().result()
+                if later < rounds:
+                    waiting.append(pool.submit(events_of, later))
+                yield replace(hits, event_number=hits.event_number + primaries)
+                primaries += n_primaries
         finally:
             pool.shutdown(cancel_futures=True)
-
-    def _round(self, detector: Detector, i: int, rounds: int, seed: int) -> tuple[Hits, int]:
-        wanted = {w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()}
-        return simulate_gammas(
-            detector,
-            source_height_mm=self.height_mm,
-            source_radius_mm=self.radius_mm,
-            n_primaries=_GAMMAS_PER_EVENT * sum(wanted.values()),
-            seed=seed,
-            wanted=wanted,
-        )
-
-
-HitSource = HitFile | GammaSource

@@ -8,18 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.errors import CpunetError
-
 FloatArray = npt.NDArray[np.float64]
 IntArray = npt.NDArray[np.int64]
-
-# Larger than any laboratory and any event. Compiled loops convert positions into indices and
-# would overflow beyond.
-FARTHEST_MM, MAX_KEV = 1e7, 1e9
-# Deposits of an event number that come later are another event, as in remage.
-WINDOW_US = 10.0
-# Deposits of an event are simulated at once; later ones would change the edge of its pulse.
-LATE_NS = 50.0
 
 
 @dataclass(frozen=True)
@@ -62,15 +52,10 @@ class Hits:
     event_number
         Event numbers of the source.
 
-    Raises
-    ------
-    CpunetError
-        If a hit lies beyond `FARTHEST_MM`.
-
     Examples
     --------
     >>> hits = Hits.of([[0, 0, 10], [5, 0, 12], [1, 1, 1]], [1000, 592.5, 2614.5], [0, 2, 3])
-    >>> hits.n_events, hits.energy_kev
+    >>> len(hits), hits.energy_kev
     (2, array([1592.5, 2614.5]))
     >>> hits[hits.energy_kev > 2000].z_mm
     array([1.])
@@ -80,13 +65,6 @@ class Hits:
     edep_kev: FloatArray
     offsets: IntArray
     event_number: IntArray
-
-    def __post_init__(self) -> None:
-        farthest = np.abs(self.position_mm).max(initial=0)
-        if farthest > FARTHEST_MM:
-            raise CpunetError(
-                f"hits: a hit lies {farthest:g} mm away; check the units and the origin"
-            )
 
     @classmethod
     def of(
@@ -122,41 +100,31 @@ class Hits:
         """Distance of each hit from the axis in mm."""
         return np.asarray(np.hypot(self.x_mm, self.y_mm))
 
-    @property
-    def n_events(self) -> int:
+    def __len__(self) -> int:
         """Number of events, including those without hits."""
         return len(self.offsets) - 1
-
-    def __len__(self) -> int:
-        return self.n_events
 
     @property
     def event_of_hit(self) -> IntArray:
         """Index (not number) of the event of each hit."""
-        return np.repeat(np.arange(self.n_events), np.diff(self.offsets))
+        return np.repeat(np.arange(len(self)), np.diff(self.offsets))
 
     @property
     def energy_kev(self) -> FloatArray:
         """Energy of each event in keV, the sum over its hits."""
         return np.bincount(
-            self.event_of_hit, weights=self.edep_kev, minlength=self.n_events
+            self.event_of_hit, weights=self.edep_kev, minlength=len(self)
         ).astype(np.float64)
 
     def __getitem__(self, which: slice | npt.NDArray[np.bool_] | IntArray) -> Hits:
         """Select events by a slice, a mask or a list of rows."""
-        rows = np.arange(self.n_events)[which]
+        rows = np.arange(len(self))[which]
         counts = self.offsets[rows + 1] - self.offsets[rows]
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         # hit j of the result is hit j - offsets[i] of its original event
         take = np.arange(offsets[-1]) + np.repeat(self.offsets[rows] - offsets[:-1], counts)
         chosen = self.position_mm[take], self.edep_kev[take]
         return Hits.of(*chosen, offsets, self.event_number[rows])
-
-    def where(self, keep: npt.NDArray[np.bool_]) -> Hits:
-        """The same events with only the hits of a mask. An event may become empty."""
-        ends = np.concatenate([[0], np.cumsum(keep)]).astype(np.int64)
-        left = self.position_mm[keep], self.edep_kev[keep]
-        return Hits.of(*left, ends[self.offsets], self.event_number)
 
     @classmethod
     def concatenate(cls, sets: Sequence[Hits]) -> Hits:

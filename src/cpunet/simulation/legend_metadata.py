@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
-from cpunet.settings import flat
+from cpunet.settings import flat, read_values
 
 # keys of a diode and the fields of the detector
 _GEOMETRY = {
@@ -68,8 +68,6 @@ _MEASURED = {
         "characterization.manufacturer.dl_thickness_in_mm",
     ),
 }
-# of the argon around LEGEND's detectors
-LIQUID_ARGON_K = 87.0
 _SIMULATED = ("icpc", "bege", "ppc")
 # parameters of each model of the impurity curve
 MODELS = {
@@ -90,7 +88,7 @@ def detector_values(
 
     Bias, measured depletion voltage and lithium thickness (the full charge collection depth,
     FCCD) come from ``characterization``, where 0 means unknown. Impurities are those of the
-    crystal, see `impurity_values`.
+    crystal in a file nearby, see `impurity_values`.
 
     Raises
     ------
@@ -104,11 +102,9 @@ def detector_values(
             f"{source}: type {reprlib.repr(kind)} is not simulated; "
             f"give one of type {', '.join(_SIMULATED)}"
         )
-    if not isinstance(diode["geometry"], Mapping):
-        raise CpunetError(f"{source}: geometry holds no keys; see LEGEND's diodes")
     geometry = dict(flat(diode["geometry"]))
-    crack = value_at(diode, "geometry.extra.crack", source)
-    if crack and geometry.get("extra.crack.width_in_mm") != 0:
+    cracked = any(key.startswith("extra.crack.") for key in geometry)
+    if cracked and geometry.get("extra.crack.width_in_mm") != 0:
         raise CpunetError(
             f"{source}: geometry.extra.crack cuts off a side; only axially symmetric "
             "crystals are simulated; remove it to simulate the crystal without it"
@@ -123,8 +119,8 @@ def detector_values(
                 f"{source}: unknown key geometry.{key} (units belong to the key); "
                 "correct or remove it"
             )
-        if field := _GEOMETRY[key]:
-            values[field] = value
+        values[_GEOMETRY[key]] = value
+    values.pop("", None)
     outer, inner = (
         _number_at(diode, f"geometry.groove.radius_in_mm.{side}", source, 0.0)
         for side in ("outer", "inner")
@@ -139,18 +135,24 @@ def detector_values(
                 f"{source}: {places[numbers.index(min(numbers))]} is below 0",
                 "correct it, or write 0 for none",
             )
-        if at := next(filter(None, numbers), 0.0):
-            values[field] = at
+        if any(numbers):
+            values[field] = next(filter(None, numbers))
+    boule, cut = values["name"][:-1], values["name"][-1:]  # V99000 and A of V99000A
+    slice_name = str((diode.get("production") or {}).get("slice") or cut)
+    folder = Path(name).parent
+    folders = folder.parent / "crystals", folder / "crystals", folder
+    ends = (".yaml", ".yml", ".json")
+    files = [place / f"{boule}{end}" for place in folders for end in ends]
+    crystal = next(filter(Path.is_file, files), None)
+    content: dict[str, Any] = read_values(crystal) if crystal else {}
+    length = values.get("crystal_length")
+    if content.get("impurity_curve") is None:
+        reasons["impurity_z0_1e10_per_cm3"] = (
+            f"{crystal} has no impurity_curve" if crystal else f"there is no {files[0]}"
+        )
+    elif isinstance(length, int | float):  # else refused with the rest of the geometry
+        values |= impurity_values(content, str(crystal), slice_name, length)
     return values, reasons
-
-
-def value_at(values: Any, place: str, source: str) -> Any:
-    """Value at a location such as ``"production.slice"``, None if there is none."""
-    for key in place.split("."):
-        if not isinstance(values, Mapping | None):
-            raise CpunetError(f"{source}: {place}: {values!r} stands before {key}; {_ANOTHER}")
-        values = values.get(key) if values else None
-    return values
 
 
 def impurity_values(
@@ -232,11 +234,13 @@ def _number_at(
     values: Mapping[str, Any], place: str, source: str, default: float | None = None
 ) -> float:
     """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
-    stored = value_at(values, place, source)
-    value = default if stored is None else stored
-    if value is None:
+    value: Any = values
+    for key in place.split("."):
+        if not isinstance(value, Mapping | None):
+            raise CpunetError(f"{source}: {place}: {value!r} stands before {key}; {_ANOTHER}")
+        value = value.get(key) if value else None
+    if (value := default if value is None else value) is None:
         raise CpunetError(f"{source}: no {place}; {_ANOTHER}")
-    number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not number or not math.isfinite(value):
+    if type(value) not in (int, float) or not math.isfinite(value):
         raise CpunetError(f"{source}: {place} = {value!r} is no number; {_ANOTHER}")
     return float(value)

@@ -36,44 +36,36 @@ def outline_of(detector: Detector) -> Outline:
     return cast("Outline", made(*(getattr(detector, name) for name in _VALUES)))
 
 
-def at(
-    loop: Any, kind: type, detector: Detector, r: npt.ArrayLike, z: npt.ArrayLike
-) -> npt.NDArray[Any]:
-    """What `fill_regions` or `fill_insides` gives at places of a detector."""
+def places(
+    detector: Detector, r: npt.ArrayLike, z: npt.ArrayLike
+) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
+    """`Detector.region` and `Detector.inside` at places of a detector."""
     r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
-    values: npt.NDArray[Any] = np.empty(r.shape, kind)
-    loop(outline_of(detector), r.flatten(), z.flatten(), values.reshape(-1))
-    return values
+    values = np.empty((2, r.size), np.int8)
+    _fill(outline_of(detector), r.flatten(), z.flatten(), values)
+    return values[0].reshape(r.shape), values[1].reshape(r.shape).astype(np.bool_)
 
 
 @kernel(error_model="numpy")
-def fill_regions(outline: Outline, r: Array, z: Array, region: npt.NDArray[np.int8]) -> None:
-    """See `Detector.region`."""
+def _fill(outline: Outline, r: Array, z: Array, values: npt.NDArray[np.int8]) -> None:
+    """Region of each place, and 1 if it lies inside."""
+    region, inside = values
     radius, length = outline.point_contact_radius, outline.point_contact_length
+    li = outline.li_thickness + _TOLERANCE
     for i in range(len(r)):
+        inside[i] = in_germanium(outline, r[i], 0.0, z[i], -_TOLERANCE)
         if r[i] <= radius + _TOLERANCE and z[i] <= length + _TOLERANCE:
             region[i] = POINT_CONTACT
-        elif not _within(outline, r[i], z[i], outline.li_thickness + _TOLERANCE, -_TOLERANCE):
+        elif not _within(outline, r[i], z[i], li, -_TOLERANCE):
             region[i] = LI_CONTACT
         else:
             region[i] = DITCH if _in_ditch(outline, r[i], z[i], _TOLERANCE) else GERMANIUM
 
 
 @kernel(error_model="numpy")
-def fill_insides(outline: Outline, r: Array, z: Array, inside: npt.NDArray[np.bool_]) -> None:
-    """See `Detector.inside`."""
-    for i in range(len(r)):
-        inside[i] = _is_germanium(outline, r[i], z[i], -_TOLERANCE)
-
-
-@kernel(error_model="numpy")
-def in_germanium(outline: Outline, x: float, y: float, z: float) -> bool:
-    """Whether a point lies in germanium, including the lithium layer."""
-    return _is_germanium(outline, math.sqrt(x * x + y * y), z, 0.0)
-
-
-@kernel(error_model="numpy")
-def _is_germanium(outline: Outline, r: float, z: float, shift: float) -> bool:
+def in_germanium(outline: Outline, x: float, y: float, z: float, shift: float) -> bool:
+    """Whether a point lies in germanium, including the lithium layer, moved in by `shift`."""
+    r = math.sqrt(x * x + y * y)
     return _within(outline, r, z, shift, shift) and not _in_ditch(outline, r, z, shift)
 
 

@@ -16,7 +16,6 @@ charges and electrode potentials takes only hundredths of a second.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -83,22 +82,21 @@ def make_grid(detector: Detector) -> Grid:
         z_mm=z,
         step_mm=h,
         region=region,
-        r_steps=_steps(detector, rr, zz, region, axis=0),
-        z_steps=_steps(detector, rr, zz, region, axis=1),
+        r_steps=_steps(detector, rr, zz, region),
+        z_steps=_steps(detector, rr.T, zz.T, region.T).T,
     )
 
 
 def _steps(
-    detector: Detector, rr: FloatArray, zz: FloatArray, region: RegionArray, axis: int
+    detector: Detector, rr: FloatArray, zz: FloatArray, region: RegionArray
 ) -> FloatArray:
-    """Fractions of the steps along `axis` that lie outside the contacts."""
-    low, high = _ends(region, axis)
-    steps = np.ones(low.shape)
-    crossing = (low <= LI_CONTACT) != (high <= LI_CONTACT)
-    # ends (low and high), coordinates (r and z), steps that cross a surface
-    nodes = np.stack([_ends(rr, axis), _ends(zz, axis)], axis=1)[..., crossing]
+    """Fractions of the steps along the first axis that lie outside the contacts."""
+    contact = region <= LI_CONTACT
+    crossing = contact[:-1] != contact[1:]
+    nodes = np.stack([rr, zz])
+    low, high = nodes[:, :-1][:, crossing], nodes[:, 1:][:, crossing]
     # start at the node outside the contact
-    start, end = np.where(low[crossing] <= LI_CONTACT, nodes[::-1], nodes)
+    start, end = np.where(contact[:-1][crossing], [high, low], [low, high])
     outside, inside = np.zeros(crossing.sum()), np.ones(crossing.sum())
     for _ in range(_BISECTIONS):
         middle = (outside + inside) / 2
@@ -106,12 +104,9 @@ def _steps(
         inside = np.where(hit, middle, inside)
         outside = np.where(hit, outside, middle)
     # a surface on the node itself counts as a full step: exact where grid and contact meet
+    steps = np.ones(crossing.shape)
     steps[crossing] = np.clip(np.where(inside > 1 - 2 * _NEAREST, 1, inside), _NEAREST, 1)
     return steps
-
-
-def _ends(values: npt.NDArray[Any], axis: int) -> tuple[npt.NDArray[Any], npt.NDArray[Any]]:
-    return (values[:-1], values[1:]) if axis == 0 else (values[:, :-1], values[:, 1:])
 
 
 EPSILON_GERMANIUM = 16.0
@@ -166,40 +161,24 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     True
     """
     r_flux, z_flux, to_ground = conductances(detector, grid)
-    free = grid.free
-
-    def from_neighbours(values: FloatArray) -> FloatArray:
-        flux = np.zeros(free.shape)
-        flux[:-1] += r_flux * values[1:]
-        flux[1:] += r_flux * values[:-1]
-        flux[:, :-1] += z_flux * values[:, 1:]
-        flux[:, 1:] += z_flux * values[:, :-1]
-        return flux
-
-    number = np.full(free.shape, -1)
-    number[free] = np.arange(free.sum())
-    diagonal = from_neighbours(np.ones(free.shape))
+    free, n_z = grid.free, len(grid.z_mm)
+    above, below = np.pad(z_flux, ((0, 0), (0, 1))), np.pad(z_flux, ((0, 0), (1, 0)))
+    diagonal = on_nodes(r_flux, r_flux, axis=0) + above + below
     diagonal[:, 0] += to_ground
-    rows, columns, values = [number[free]], [number[free]], [diagonal[free]]
-    for flux, low, high in (
-        (r_flux, number[:-1], number[1:]),
-        (z_flux, number[:, :-1], number[:, 1:]),
-    ):
-        both = (low >= 0) & (high >= 0)
-        rows += [low[both], high[both]]
-        columns += [high[both], low[both]]
-        values += [-flux[both], -flux[both]]
-    matrix = sp.csc_matrix(
-        (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-    )
+    bands = [r_flux.ravel(), above.ravel()[:-1]]
+    neighbours = sp.diags_array(2 * bands, offsets=(n_z, 1, -n_z, -1)).tocsr()
+    matrix = (sp.diags_array(diagonal.ravel()) - neighbours)[free.ravel()][:, free.ravel()]
     # symmetric and diagonally dominant: no pivoting, and an ordering that exploits it
     options = {"SymmetricMode": True}
-    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
+    factors = splu(
+        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+    )
 
     def solved(boundary: FloatArray, charge: FloatArray) -> FloatArray:
         # potentials of contacts are given: their columns are moved to the right-hand side
         potential = boundary.copy()
-        potential[free] = factors.solve((charge + from_neighbours(boundary))[free])
+        given = (neighbours @ boundary.ravel()).reshape(free.shape)
+        potential[free] = factors.solve((charge + given)[free])
         return potential
 
     nothing = np.zeros(free.shape)
@@ -207,7 +186,9 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     bias = solved((grid.region == LI_CONTACT).astype(float), nothing)
     impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
     impurities = solved(nothing, charges(detector, grid, impurity))
-    tilt = solved(nothing, charges(detector, grid, detector.per_tilt_cm(grid.z_mm)))
+    tilt = solved(
+        nothing, charges(detector, grid, (grid.z_mm - detector.crystal_length / 2) / 10)
+    )
     surface = nothing
     if detector.surface_charge_1e10_per_cm2:
         surface = solved(nothing, surface_charges(detector, grid))
@@ -230,18 +211,13 @@ def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray
     h = grid.step_mm
     epsilon = 1 + (EPSILON_GERMANIUM - 1) * _germanium_in_cells(detector, grid)
     # a step in r crosses the upper half of the cell below it and the lower of the one above
-    between = np.zeros((epsilon.shape[0], epsilon.shape[1] + 1))
-    between[:, 1:] += epsilon / 2
-    between[:, :-1] += epsilon / 2
+    between = on_nodes(epsilon / 2, epsilon / 2, axis=1)
     middle = (grid.r_mm[:-1] + grid.r_mm[1:]) / 2
     r_flux = between * middle[:, np.newaxis] / grid.r_steps
     inner, outer = _half_rings(grid)
-    z_flux = np.zeros((len(grid.r_mm), epsilon.shape[1]))
-    z_flux[1:] += epsilon * inner[1:, np.newaxis] / h
-    z_flux[:-1] += epsilon * outer[:-1, np.newaxis] / h
-    z_flux /= grid.z_steps
+    z_flux = on_nodes(epsilon * inner[1:] / h, epsilon * outer[:-1] / h, axis=0) / grid.z_steps
     gap = detector.vacuum_gap
-    to_ground = (inner + outer) / gap if gap else np.zeros(len(grid.r_mm))
+    to_ground = (inner + outer)[:, 0] / gap if gap else np.zeros(len(grid.r_mm))
     return r_flux, z_flux, to_ground
 
 
@@ -262,13 +238,9 @@ def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
         # in fieldgen the ditch has 1/16 of the charge density of germanium
         germanium = germanium + (1 - germanium) / EPSILON_GERMANIUM
     inner, outer = _half_rings(grid)
-    by_column = np.zeros((len(grid.r_mm), germanium.shape[1]))
-    by_column[1:] += germanium * inner[1:, np.newaxis] * grid.step_mm / 2
-    by_column[:-1] += germanium * outer[:-1, np.newaxis] * grid.step_mm / 2
-    volume = np.zeros(grid.region.shape)
-    volume[:, 1:] += by_column
-    volume[:, :-1] += by_column
-    return np.asarray(VOLT_PER_MM2 * impurity * volume)
+    h = grid.step_mm
+    half = on_nodes(germanium * inner[1:] * h / 2, germanium * outer[:-1] * h / 2, axis=0)
+    return np.asarray(VOLT_PER_MM2 * impurity * on_nodes(half, half, axis=1))
 
 
 def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
@@ -285,7 +257,7 @@ def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
     inner, outer = _half_rings(grid)
     face = np.zeros(grid.region.shape)
     if detector.siggen_conventions:
-        face[:, 0] = (inner + outer) * (grid.region[:, 0] == GERMANIUM)
+        face[:, 0] = (inner + outer)[:, 0] * (grid.region[:, 0] == GERMANIUM)
         if not face.any():
             raise CpunetError(
                 f"detector {detector.name}: the ditch leaves no germanium on z = 0 for "
@@ -294,11 +266,9 @@ def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
             )
     else:
         germanium = _germanium_in_cells(detector, grid)
-        face[1:, 0] += germanium[:, 0] * inner[1:]
-        face[:-1, 0] += germanium[:, 0] * outer[:-1]
-        floor = np.abs(np.diff(germanium, axis=1))
-        face[1:, 1:-1] += floor * inner[1:, np.newaxis]
-        face[:-1, 1:-1] += floor * outer[:-1, np.newaxis]
+        # below z = 0 and in the ditch is no germanium
+        floor = np.abs(np.diff(germanium, axis=1, prepend=0))
+        face[:, :-1] = on_nodes(floor * inner[1:], floor * outer[:-1], axis=0)
         half_wall = np.abs(np.diff(germanium, axis=0)) * grid.step_mm / 2
         half_wall *= grid.r_mm[1:-1, np.newaxis]
         face[1:-1, 1:] += half_wall
@@ -307,21 +277,25 @@ def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
     return np.asarray(10 * VOLT_PER_MM2 * detector.surface_charge_1e10_per_cm2 * face)
 
 
+def on_nodes(above: FloatArray, below: FloatArray, axis: int) -> FloatArray:
+    """Sums at the nodes between cells along an axis: of the cell before, and of that after."""
+    before, after = [(0, 0), (0, 0)], [(0, 0), (0, 0)]
+    before[axis], after[axis] = (1, 0), (0, 1)
+    return np.asarray(np.pad(above, before) + np.pad(below, after))
+
+
 def _half_rings(grid: Grid) -> tuple[FloatArray, FloatArray]:
-    """Area per unit angle, in mm2, of each node's half ring towards the axis and away."""
-    r, h = grid.r_mm, grid.step_mm
+    """Area (nr, 1) per unit angle, in mm2, of each half ring towards the axis and away."""
+    r, h = grid.r_mm[:, np.newaxis], grid.step_mm
     inner = np.where(r > 0, (r**2 - (r - h / 2) ** 2) / 2, 0)
     return inner, ((r + h / 2) ** 2 - r**2) / 2
 
 
 def _germanium_in_cells(detector: Detector, grid: Grid) -> FloatArray:
     """Fraction (nr-1, nz-1) of each cell between four nodes that lies outside the ditch."""
-
-    def covered(edges: FloatArray, low: float, high: float) -> FloatArray:
-        overlap = np.minimum(edges[1:], high) - np.maximum(edges[:-1], low)
-        return np.asarray(np.maximum(overlap, 0) / grid.step_mm)
-
     inner, outer, depth = detector.ditch_walls
-    in_r = covered(grid.r_mm, inner, outer)
-    in_z = covered(grid.z_mm, 0.0, depth)
+    in_r, in_z = (
+        np.maximum(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0) / grid.step_mm
+        for edges, low, high in ((grid.r_mm, inner, outer), (grid.z_mm, 0.0, depth))
+    )
     return np.asarray(1 - in_r[:, np.newaxis] * in_z)

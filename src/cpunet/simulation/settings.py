@@ -27,11 +27,6 @@ _FINER_NS = (2.0, 1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
 MERGING_MM = 0.2
 
 
-def _is_multiple(dt_ns: float, step_ns: float) -> bool:
-    ratio = dt_ns / step_ns
-    return ratio > 1 - 1e-9 and abs(ratio - round(ratio)) < 1e-9
-
-
 class SimulationSettings(Config):
     r"""Settings of the pulse simulation.
 
@@ -110,14 +105,6 @@ class SimulationSettings(Config):
         return round(self.dt_ns / self.step_ns)
 
     @property
-    def velocity_factors(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Speed factors at low and high fields, of electrons and of holes."""
-        return (
-            (self.electron_velocity_low_factor, self.electron_velocity_high_factor),
-            (self.hole_velocity_low_factor, self.hole_velocity_high_factor),
-        )
-
-    @property
     def trapping_per_ns(self) -> tuple[float, float]:
         """Trapping rates of electrons and holes in 1/ns."""
         return self.electron_trapping_per_us / 1000, self.hole_trapping_per_us / 1000
@@ -132,9 +119,12 @@ class SimulationSettings(Config):
 
     @model_validator(mode="after")
     def _whole_steps(self) -> SimulationSettings:
-        if not _is_multiple(self.dt_ns, self.step_ns):
-            finer = [s for s in _FINER_NS if s < self.step_ns and _is_multiple(self.dt_ns, s)]
-            remedy = f"add step_ns={finer[0]:g}" if finer else "choose another"
+        steps = [self.step_ns, *(s for s in _FINER_NS if s < self.step_ns)]
+        dividing = [
+            s for s in steps if abs(self.dt_ns / s - max(round(self.dt_ns / s), 1)) < 1e-9
+        ]
+        if self.step_ns not in dividing:
+            remedy = f"add step_ns={dividing[0]:g}" if dividing else "choose another"
             raise ValueError(
                 f"dt_ns must be a multiple of step_ns, {self.step_ns:g} ns; {remedy}"
             )

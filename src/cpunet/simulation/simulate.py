@@ -1,7 +1,4 @@
-"""Simulate the pulses of hits in a detector, for the simulated side of a training.
-
-Simulate the hits of stored pulses again, with other physics, as needed for a calibration.
-"""
+"""Simulate the pulses of hits in a detector, for the simulated side of a training."""
 
 from __future__ import annotations
 
@@ -23,18 +20,15 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, require_seed
-from cpunet.simulation.fields import NOT_IN_PARTS, Superposition, solve, superposed_fields
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_files import hit_columns, read_hits
+from cpunet.simulation.hit_files import HIT_TABLE, hit_columns, read_hits
 from cpunet.simulation.hit_sources import (
     GammaSource,
     HitFile,
-    HitSource,
     energy_windows,
     wanted_events,
 )
-from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT
 from cpunet.simulation.settings import SimulationSettings, detector_and_settings
@@ -182,7 +176,7 @@ def simulate(
     crystal, physics = detector_and_settings(detector, settings)
     peaks = load_recipe("fast").peaks
     windows = energy_windows(",".join(peaks), peaks, physics.window_kev)
-    source: HitSource
+    source: HitFile | GammaSource
     if hits is not None:
         source = hits if isinstance(hits, HitFile) else HitFile(Path(hits), frame)
         if events is not None:
@@ -284,76 +278,3 @@ class StoredSimulation:
                 "simulate it again"
             )
         return cls(detector, settings, hits)
-
-
-# Maximum number of time steps that a drift step of quick pulses replaces.
-_QUICK_STRIDE = 5
-# Maximum number of detector shapes (such as lithium thicknesses) whose potentials are held.
-_MAX_SHAPES = 4
-
-
-class SameHits:
-    """Hits of a set of events, for repeated simulation with other physics.
-
-    Another temperature, bias, velocity, cloud or trapping, or another scale or tilt of the
-    impurities, needs no new solution of the fields. Another shape of the active germanium,
-    such as another ``li_thickness``, needs one (seconds, then cached).
-
-    Parameters
-    ----------
-    hits
-        Merged events in the frame of the crystal.
-
-    Examples
-    --------
-    >>> from cpunet.simulation.geometry_readers import read_detector
-    >>> hits = Hits.of([[20, 0, 40], [0, 9, 12]], [2600, 14.5], [0, 2])
-    >>> same, settings = SameHits(hits), SimulationSettings()
-    >>> cold, warm = (
-    ...     same.simulate(read_detector("ppc", [f"temperature_K={t}"]), settings).waveforms
-    ...     for t in (85, 95)
-    ... )
-    >>> bool(warm.sum() < cold.sum())  # warm charges are slower
-    True
-    """
-
-    def __init__(self, hits: Hits) -> None:
-        self._hits = hits
-        self._solutions: dict[str, Superposition] = {}
-
-    def simulate(
-        self,
-        detector: Detector,
-        settings: SimulationSettings,
-        *,
-        quick: bool = False,
-        most: int | None = None,
-    ) -> EventPulses:
-        """Pulses of the events with the physics of `detector` and `settings`.
-
-        Parameters
-        ----------
-        detector, settings
-            Detector and simulation settings.
-        quick
-            Whether to take longer steps, for differences between two sets of physics: its
-            errors are nearly equal in both. See benchmarks/same_hits.py for accuracy and speed.
-        most
-            Number of first events to simulate; None for all.
-
-        Raises
-        ------
-        CpunetError
-            If the detector is not depleted, or a hit is not finite.
-        """
-        key = detector.fingerprint(exclude=NOT_IN_PARTS)
-        if key not in self._solutions:
-            if len(self._solutions) == _MAX_SHAPES:
-                # keep the first, with which all others are compared
-                del self._solutions[list(self._solutions)[1]]
-            self._solutions[key] = solve(detector)
-        fields = superposed_fields(self._solutions[key], detector, depletion=False)
-        steps = settings.steps_per_sample if quick else 1
-        stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0)
-        simulator = Simulator(detector, settings, fields=fields, stride=stride)
-        return simulator.events(self._hits[:most])

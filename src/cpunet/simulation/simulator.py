@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +37,7 @@ from cpunet.simulation.hits import Hits, OpenHits
 from cpunet.simulation.settings import SimulationSettings
 
 _CHUNK = 25  # events per task of a thread
+_QUICK_STRIDE = 5  # most time steps that a step of the drift of quick pulses replaces
 _POINT = (0.0, 0.0, 0.0)  # a cloud without a size
 
 BoolArray = npt.NDArray[np.bool_]
@@ -68,6 +68,11 @@ class EventPulses:
         FWHM in ns of the smearing by the charge cloud of a hit; NaN if not valid.
     trapped
         Fraction of the signal of a hit that is lost to trapping; NaN if not valid.
+    lost_kev, trapped_kev
+        Energy in keV of each event in hits without a signal, and of those with a signal the
+        part that is lost to trapping.
+    collected_kev
+        Energy in keV of each event that gives a signal, which is what a detector measures.
     """
 
     waveforms: npt.NDArray[np.float32]
@@ -78,34 +83,17 @@ class EventPulses:
     collection_time_ns: FloatArray
     cloud_fwhm_ns: FloatArray
     trapped: FloatArray
-
-    @cached_property
-    def lost_kev(self) -> FloatArray:
-        """Energy in keV of the hits of each event without a signal."""
-        return self._by_event(np.where(self.valid, 0.0, self.hits.edep_kev))
-
-    @cached_property
-    def trapped_kev(self) -> FloatArray:
-        """Energy in keV of each event whose signal is lost to trapping."""
-        return self._by_event(np.where(self.valid, self.hits.edep_kev * self.trapped, 0.0))
-
-    def _by_event(self, of_hits: FloatArray) -> FloatArray:
-        sums = np.bincount(self.hits.event_of_hit, of_hits, len(self.hits))
-        return sums.astype(np.float64)  # integers without any hit
-
-    @property
-    def collected_kev(self) -> FloatArray:
-        """Energy in keV that gives a signal, which is what a detector measures."""
-        return self.hits.energy_kev - self.lost_kev - self.trapped_kev
+    lost_kev: FloatArray
+    trapped_kev: FloatArray
+    collected_kev: FloatArray
 
     def pulses(self) -> Pulses:
         """Events with a signal as `Pulses`, with their collected energies."""
-        energy_kev = self.collected_kev
-        with_signal = energy_kev > 0
+        with_signal = self.collected_kev > 0
         return Pulses.of(
             self.waveforms[with_signal],
             dt_ns=self.dt_ns,
-            energy_kev=energy_kev[with_signal],
+            energy_kev=self.collected_kev[with_signal],
             event_number=self.hits.event_number[with_signal],
         )
 
@@ -148,8 +136,9 @@ class Simulator:
         Simulation settings.
     fields
         Field maps of the detector, where they are at hand.
-    stride
-        Number of time steps that a step of the drift replaces, a divisor of those per sample.
+    quick
+        Whether to take longer steps, for differences between two sets of physics: their errors
+        are nearly equal in both. See benchmarks/same_hits.py for accuracy and speed.
 
     Raises
     ------
@@ -188,15 +177,15 @@ class Simulator:
         settings: SimulationSettings,
         *,
         fields: FieldMaps | None = None,
-        stride: int = 1,
+        quick: bool = False,
     ) -> None:
-        if fields is None:
-            with stage(f"Fields of {detector.name or 'the detector'}"):
-                fields = compute_fields(detector)
-        self.detector, self.settings, self.fields = detector, settings, fields
-        self._maps = drift_maps(fields, detector.temperature_K, settings)
+        self.detector, self.settings = detector, settings
+        self.fields = fields or compute_fields(detector)
+        self._maps = drift_maps(self.fields, detector.temperature_K, settings)
         constant = diffusion_constant(settings.diffusion_constant, detector.temperature_K)
         growing = settings.diffusion or settings.self_repulsion > 0
+        steps = settings.steps_per_sample
+        stride = max(n for n in range(1, _QUICK_STRIDE + 1) if steps % n == 0) if quick else 1
         self._task = Task(
             cloud_fwhm_mm=max(settings.cloud_fwhm_mm, SMALLEST_FWHM_MM if growing else 0.0),
             diffusion=constant if settings.diffusion else 0.0,
@@ -204,7 +193,7 @@ class Simulator:
             whole_steps=settings.diffusion_constant == "siggen",
             step_ns=stride * settings.step_ns,
             stride=stride,
-            per_sample=settings.steps_per_sample // stride,
+            per_sample=steps // stride,
         )
 
     def signals(
@@ -231,25 +220,23 @@ class Simulator:
         columns = np.broadcast_arrays(x_mm, y_mm, z_mm, edep_kev)
         table = np.stack(columns, axis=-1).astype(np.float64).reshape(-1, 4)
         hits = Hits.of(table[:, :3], table[:, 3], np.arange(len(table) + 1))
-        return self._pulses(hits, weighted=False)
+        return self.events(hits, weighted=False)
 
-    def events(self, hits: Hits) -> EventPulses:
+    def events(self, hits: Hits, *, weighted: bool = True) -> EventPulses:
         r"""Pulse of each event.
 
         It is the energy-weighted mean of the pulses :math:`S_i` of its hits,
 
         .. math:: S = \frac{\sum_i E_i S_i}{\sum_i E_i (1 - t_i)},
 
-        over all hits with a signal, with the trapped fractions :math:`t_i`.
+        over all hits with a signal, with the trapped fractions :math:`t_i`. Unless `weighted`,
+        it is the sum of :math:`S_i`.
 
         Raises
         ------
         CpunetError
             If the position or energy of a hit is not finite.
         """
-        return self._pulses(hits, weighted=True)
-
-    def _pulses(self, hits: Hits, *, weighted: bool) -> EventPulses:
         table = np.column_stack([hits.position_mm, hits.edep_kev])
         bad = np.flatnonzero(~np.isfinite(table).all(axis=1))
         if len(bad):
@@ -258,15 +245,23 @@ class Simulator:
         facts = np.full((len(table), 4), np.nan)
         _sum_events(self._maps, table, hits.offsets, self._task, weighted, waveforms, facts)
         last_step, all_collected, fwhm_steps, trapped = facts.T
+        valid = np.isfinite(last_step)
+        lost_kev, trapped_kev = (
+            np.bincount(hits.event_of_hit, part * hits.edep_kev, len(hits)).astype(float)
+            for part in (~valid, np.where(valid, trapped, 0.0))  # integers without any hit
+        )
         return EventPulses(
             waveforms=waveforms,
             dt_ns=self.settings.dt_ns,
             hits=hits,
-            valid=np.isfinite(last_step),
+            valid=valid,
             collected=all_collected == 1.0,
             collection_time_ns=last_step * self._task.step_ns,
             cloud_fwhm_ns=fwhm_steps * self._task.step_ns,
             trapped=trapped,
+            lost_kev=lost_kev,
+            trapped_kev=trapped_kev,
+            collected_kev=hits.energy_kev - lost_kev - trapped_kev,
         )
 
     def blocks(self, source: OpenHits, title: str) -> Iterator[tuple[int, EventPulses]]:
@@ -293,8 +288,13 @@ class Simulator:
         """
         start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
         start = start.reshape(-1, 3)
-        paths = np.full((2, len(start), self.settings.n_steps, 3), np.nan)
-        _fill_paths(self._maps, start, self.settings.step_ns, paths)
+        n_steps, step_ns = self.settings.n_steps, self.settings.step_ns
+        paths, signal = np.full((2, len(start), n_steps, 3), np.nan), np.zeros(n_steps)
+        for i, (x, y, z) in enumerate(start.tolist()):
+            if in_active_volume(self._maps, x, y, z):
+                for carrier in (ELECTRON, HOLE):
+                    path = paths[carrier, i]
+                    drift(self._maps, carrier, (x, y, z), step_ns, 1, _POINT, signal, path)
         return paths[ELECTRON], paths[HOLE]
 
 
@@ -308,77 +308,51 @@ def _sum_events(
     waveforms: npt.NDArray[np.float32],
     facts: FloatArray,
 ) -> None:
-    """Fill the pulses of events, and the facts of hits with a signal (see `_add_pulse`).
+    """Fill the pulses of events, and the facts of hits with a signal.
 
-    Pulses are means weighted by energy, or sums unless `weighted`.
+    Pulses are means weighted by energy, or sums unless `weighted`. The facts are the last step,
+    whether all charge is collected, the FWHM in steps of the smearing by the cloud, and the
+    fraction trapped.
     """
     n_events, n_samples = waveforms.shape
     # work arrays are shared by a chunk of events
     for chunk in prange((n_events + _CHUNK - 1) // _CHUNK):
-        out = np.empty(n_samples)
+        out, no_path = np.empty(n_samples), np.empty((0, 3))
         signal = np.empty(n_samples * task.per_sample)
         for event in range(chunk * _CHUNK, min((chunk + 1) * _CHUNK, n_events)):
             out[:] = 0.0
             collected = trapped = 0.0
             for i in range(offsets[event], offsets[event + 1]):
-                hit = hits[i]
-                if in_active_volume(maps, hit[0], hit[1], hit[2]):
-                    _add_pulse(
-                        maps, hit, task, hit[3] if weighted else 1.0, signal, out, facts[i]
-                    )
-                    collected += hit[3]
-                    trapped += hit[3] * facts[i, 3]
+                x, y, z, energy = hits[i, 0], hits[i, 1], hits[i, 2], hits[i, 3]
+                if not in_active_volume(maps, x, y, z):
+                    continue
+                signal[:] = 0.0
+                start = (x, y, z)
+                cloud = (task.cloud_fwhm_mm, task.diffusion, task.repulsion_per_kev * energy)
+                steps_e, arrived_e, _, _, trapped_e = drift(
+                    maps, ELECTRON, start, task.step_ns, task.stride, _POINT, signal, no_path
+                )
+                steps_h, arrived_h, size, speed, trapped_h = drift(
+                    maps, HOLE, start, task.step_ns, task.stride, cloud, signal, no_path
+                )
+                fwhm = 0.0
+                if size > 0.0 and speed > 0.0:
+                    fwhm = size / (speed * task.step_ns)
+                    if task.whole_steps:
+                        fwhm = float(int(1.5 + fwhm))
+                        fwhm = fwhm if fwhm > 1.0 else 0.0
+                if task.stride > 1:  # means over the time steps that a step replaces
+                    later = (task.stride - 1) / (2 * task.stride)
+                    for k in range(len(signal) - 1):
+                        signal[k] += later * (signal[k + 1] - signal[k])
+                last, sigma = max(steps_e, steps_h), fwhm / FWHM_PER_SIGMA
+                weight = energy if weighted else 1.0
+                smear_and_sample(signal, task.per_sample, sigma, last, weight, out)
+                facts[i, 0], facts[i, 1] = last, 1.0 if arrived_e and arrived_h else 0.0
+                facts[i, 2], facts[i, 3] = fwhm, trapped_e + trapped_h
+                collected += energy
+                trapped += energy * facts[i, 3]
             scale = collected - trapped if weighted else 1.0
             if scale > 0.0:
                 for j in range(n_samples):
                     waveforms[event, j] = out[j] / scale
-
-
-@kernel
-def _add_pulse(
-    maps: DriftMaps,
-    hit: FloatArray,
-    task: Task,
-    weight: float,
-    signal: FloatArray,
-    out: FloatArray,
-    facts: FloatArray,
-) -> None:
-    """Add `weight` times the pulse of a hit to `out`; `signal` is an array to work in.
-
-    The facts are the last step, whether all charge is collected, the FWHM in steps of the
-    smearing by the cloud, and the fraction trapped.
-    """
-    signal[:] = 0.0
-    start, no_path = (hit[0], hit[1], hit[2]), np.empty((0, 3))
-    growing = (task.cloud_fwhm_mm, task.diffusion, task.repulsion_per_kev * hit[3])
-    steps_e, arrived_e, _, _, trapped_e = drift(
-        maps, ELECTRON, start, task.step_ns, task.stride, _POINT, signal, no_path
-    )
-    steps_h, arrived_h, size, speed, trapped_h = drift(
-        maps, HOLE, start, task.step_ns, task.stride, growing, signal, no_path
-    )
-    fwhm = 0.0
-    if size > 0.0 and speed > 0.0:
-        fwhm = size / (speed * task.step_ns)
-        if task.whole_steps:
-            fwhm = float(int(1.5 + fwhm))
-            fwhm = fwhm if fwhm > 1.0 else 0.0
-    if task.stride > 1:  # means over the time steps that a step of the drift replaces
-        later = (task.stride - 1) / (2 * task.stride)
-        for i in range(len(signal) - 1):
-            signal[i] += later * (signal[i + 1] - signal[i])
-    last = max(steps_e, steps_h)
-    smear_and_sample(signal, task.per_sample, fwhm / FWHM_PER_SIGMA, last, weight, out)
-    facts[0], facts[1] = last, 1.0 if arrived_e and arrived_h else 0.0
-    facts[2], facts[3] = fwhm, trapped_e + trapped_h
-
-
-@kernel
-def _fill_paths(maps: DriftMaps, start: FloatArray, step_ns: float, paths: FloatArray) -> None:
-    signal = np.zeros(paths.shape[2])
-    for i in range(len(start)):
-        here = (start[i, 0], start[i, 1], start[i, 2])
-        if in_active_volume(maps, here[0], here[1], here[2]):
-            for carrier in range(2):
-                drift(maps, carrier, here, step_ns, 1, _POINT, signal, paths[carrier, i])

@@ -1,6 +1,9 @@
 """Hits of the 2614.5 keV gamma line of Tl-208 in a germanium detector.
 
-In the compiled event loop photons from the source are followed until absorbed or lost.
+In the compiled event loop photons from the source are followed until absorbed or lost, and
+electrons and positrons slow down in tabulated steps. Energies are in MeV, directions are unit
+vectors. Compton: Klein and Nishina, sampled as in Nelson et al., SLAC-265 (1985), § 2.9.
+Annihilation in flight: Heitler's cross section.
 """
 
 from __future__ import annotations
@@ -16,28 +19,18 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
-from cpunet.simulation.gammas.electrons import (
+from cpunet.simulation.gammas.tables import (
+    ELECTRON_CUT,
     ELECTRON_MASS,
-    HITS,
     K_BINDING,
-    LOST,
+    LOG_RATIO,
+    LOG_TOP,
     PHOTON_CUT,
-    PHOTONS,
     Array,
     ElectronTable,
-    Event,
     PhotonTable,
-    UnitVector,
-    compton_energy,
     electron_table,
-    forward,
-    pair_share,
     photon_table,
-    put_photon,
-    record,
-    remainder,
-    slow_down,
-    turned,
 )
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
@@ -51,26 +44,226 @@ MAX_HITS, MAX_PHOTONS = 2000, 256
 """Maximum numbers of hits and of photons per event; Tl-208 gives about 200 hits."""
 
 
-class SourceDisc(NamedTuple):
-    """A disc above the crystal that emits into the cone around the top of the crystal."""
+class UnitVector(NamedTuple):
+    """A unit vector."""
 
-    energy: float
-    height: float
-    radius: float
-    least_cosine: float
+    x: float
+    y: float
+    z: float
+
+
+@kernel(error_model="numpy")
+def turned(axis: UnitVector, cosine: float, azimuth: float) -> UnitVector:
+    """Direction at a polar angle and an azimuth (rad) relative to an axis."""
+    sine = math.sqrt(max(1.0 - cosine * cosine, 0.0))
+    a, b = sine * math.cos(azimuth), sine * math.sin(azimuth)
+    across = math.sqrt(axis.x * axis.x + axis.y * axis.y)
+    if across < 1e-9:
+        return UnitVector(a, b, cosine if axis.z > 0 else -cosine)
+    return UnitVector(
+        (a * axis.x * axis.z - b * axis.y) / across + axis.x * cosine,
+        (a * axis.y * axis.z + b * axis.x) / across + axis.y * cosine,
+        -a * across + axis.z * cosine,
+    )
+
+
+@kernel(error_model="numpy")
+def forward(axis: UnitVector, kinetic: float, rng: np.random.Generator) -> UnitVector:
+    """Draw a direction that is isotropic in the rest frame of an electron along the axis.
+
+    This is a common approximation of the angles of photoelectrons, pairs and bremsstrahlung.
+    Multiple scattering randomises them within a fraction of the range.
+    """
+    gamma = 1.0 + kinetic / ELECTRON_MASS
+    beta = math.sqrt(max(1.0 - 1.0 / (gamma * gamma), 0.0))
+    at_rest = 2.0 * rng.random() - 1.0
+    cosine = (at_rest + beta) / (at_rest * beta + 1.0)
+    return turned(axis, cosine, 2.0 * math.pi * rng.random())
+
+
+@kernel(error_model="numpy")
+def remainder(total: float, axis: UnitVector, part: float, direction: UnitVector) -> UnitVector:
+    """Direction of the remaining momentum after a part is removed from one along `axis`."""
+    x = total * axis.x - part * direction.x
+    y = total * axis.y - part * direction.y
+    z = total * axis.z - part * direction.z
+    size = math.sqrt(x * x + y * y + z * z)
+    if size == 0.0:
+        return axis
+    return UnitVector(x / size, y / size, z / size)
+
+
+@kernel(error_model="numpy")
+def compton_energy(energy: float, rng: np.random.Generator) -> float:
+    r"""Energy of a photon after Compton scattering on a free electron at rest.
+
+    The energy fraction :math:`\epsilon` follows Klein and Nishina,
+
+    .. math:: p(\epsilon) \propto \frac{1}{\epsilon} + \epsilon - \sin^2\theta, \qquad
+        1 - \cos\theta = \frac{m_e c^2}{E} \Big(\frac{1}{\epsilon} - 1\Big).
+    """
+    k = energy / ELECTRON_MASS
+    least = 1.0 / (1.0 + 2.0 * k)
+    inverse_part = -math.log(least)
+    linear_part = 0.5 * (1.0 - least * least)
+    while True:
+        if rng.random() * (inverse_part + linear_part) < inverse_part:
+            share = math.exp(math.log(least) * rng.random())
+        else:
+            share = math.sqrt(least * least + (1.0 - least * least) * rng.random())
+        t = (1.0 - share) / (k * share)
+        sine2 = t * (2.0 - t)
+        if rng.random() < 1.0 - share * sine2 / (1.0 + share * share):
+            return energy * share
+
+
+@kernel(error_model="numpy")
+def pair_share(rng: np.random.Generator) -> float:
+    """Electron's fraction of a pair's kinetic energy: p+ p-, the phase space at threshold."""
+    while True:
+        share = rng.random()
+        if rng.random() < 2.0 * math.sqrt(share * (1.0 - share)):
+            return share
+
+
+@kernel(error_model="numpy")
+def annihilation_energy(kinetic: float, rng: np.random.Generator) -> tuple[float, float]:
+    """Energy of one of the two photons, and the cosine of its angle to the positron."""
+    gamma = 1.0 + kinetic / ELECTRON_MASS
+    half_width = 0.5 * math.sqrt((gamma - 1.0) / (gamma + 1.0))
+    least, most = 0.5 - half_width, 0.5 + half_width
+    while True:
+        share = least * (most / least) ** rng.random()
+        weight = 1.0 - share + (2.0 * gamma * share - 1.0) / (share * (gamma + 1.0) ** 2)
+        if rng.random() < weight:
+            break
+    cosine = (share * (gamma + 1.0) - 1.0) / (share * math.sqrt(gamma * gamma - 1.0))
+    energy = share * (kinetic + 2.0 * ELECTRON_MASS)
+    return energy, min(max(cosine, -1.0), 1.0)
+
+
+# Entries of `Event.counts`.
+HITS, PHOTONS, LOST = range(3)
+
+
+class Event(NamedTuple):
+    """An event as it develops.
+
+    ``hits`` has a row x, y, z (mm), energy (MeV) per deposit, ``photons`` a row x, y, z,
+    direction, energy per photon still to be followed. ``counts`` are the numbers of both, and
+    of deposits and photons for which there was no room.
+    """
+
+    hits: Array
+    photons: Array
+    counts: npt.NDArray[np.int64]
+
+
+@kernel(error_model="numpy")
+def record(event: Event, x: float, y: float, z: float, energy: float) -> None:
+    """Append a deposit (mm, MeV)."""
+    n = event.counts[HITS]
+    if energy > 0.0 and n < len(event.hits):
+        event.hits[n, :] = (x, y, z, energy)
+        event.counts[HITS] = n + 1
+    elif energy > 0.0:
+        event.counts[LOST] += 1
+
+
+@kernel(error_model="numpy")
+def put_photon(
+    event: Event, x: float, y: float, z: float, direction: UnitVector, energy: float
+) -> None:
+    """Append a photon to those still to be followed."""
+    n = event.counts[PHOTONS]
+    if n == len(event.photons):
+        event.counts[LOST] += 1
+        return
+    event.photons[n, :] = (x, y, z, direction.x, direction.y, direction.z, energy)
+    event.counts[PHOTONS] = n + 1
+
+
+@kernel(error_model="numpy")
+def row_of(table: ElectronTable, kinetic: float) -> int:
+    """Index of the step that contains an energy (MeV), from its upper end downwards."""
+    if kinetic <= ELECTRON_CUT:
+        return 0
+    row = int((math.log(kinetic) - LOG_TOP) / LOG_RATIO)
+    return min(max(row, 0), len(table.energy) - 2)
+
+
+@kernel(error_model="numpy")
+def slow_down(
+    outline: Outline,
+    table: ElectronTable,
+    event: Event,
+    position: tuple[float, float, float],
+    direction: UnitVector,
+    kinetic: float,
+    positron: bool,
+    rng: np.random.Generator,
+) -> None:
+    """Follow an electron until it stops or escapes, with its deposits and photons.
+
+    Each step runs straight to a random hinge, deposits its energy there, turns and runs
+    straight to its end (Baró et al., NIM B 100 (1995) 31). Mean and spread of the
+    displacement are therefore correct despite the long steps.
+    """
+    x, y, z = position
+    row = row_of(table, kinetic)
+    part = (kinetic - table.energy[row + 1]) / (table.energy[row] - table.energy[row + 1])
+    while kinetic > ELECTRON_CUT:
+        length = part * table.step[row]
+        hinge = length * rng.random()
+        x, y, z = x + hinge * direction.x, y + hinge * direction.y, z + hinge * direction.z
+        if not in_germanium(outline, x, y, z, 0.0):
+            return
+        record(event, x, y, z, kinetic - table.energy[row + 1])
+        kinetic = table.energy[row + 1]
+        scale = table.scattering[row] * part
+        cosine = 1.0 + scale * math.log(1.0 - rng.random() * table.scattering_cut[row])
+        direction = turned(direction, cosine, 2.0 * math.pi * rng.random())
+        rest = length - hinge
+        x, y, z = x + rest * direction.x, y + rest * direction.y, z + rest * direction.z
+        if not in_germanium(outline, x, y, z, 0.0):
+            return
+        chance = rng.random()
+        if chance < part * table.brems[row]:
+            shares = table.photon_share[row]
+            at = rng.random() * (len(shares) - 1)
+            node = int(at)
+            share = shares[node] + (at - node) * (shares[node + 1] - shares[node])
+            photon = min(share, 1.0) * kinetic
+            put_photon(event, x, y, z, forward(direction, kinetic, rng), photon)
+            kinetic -= photon
+            row = row_of(table, kinetic)
+            above = table.energy[row + 1]
+            part = (kinetic - above) / (table.energy[row] - above)
+            continue
+        if positron and 1.0 - chance < part * table.annihilation[row]:
+            energy, cosine = annihilation_energy(kinetic, rng)
+            momentum = math.sqrt(kinetic * (kinetic + 2.0 * ELECTRON_MASS))
+            first = turned(direction, cosine, 2.0 * math.pi * rng.random())
+            put_photon(event, x, y, z, first, energy)
+            second = remainder(momentum, direction, energy, first)
+            put_photon(event, x, y, z, second, kinetic + 2.0 * ELECTRON_MASS - energy)
+            return
+        row, part = row + 1, 1.0
+    record(event, x, y, z, kinetic)
+    if positron:
+        cosine, up = 2.0 * rng.random() - 1.0, UnitVector(0.0, 0.0, 1.0)
+        first = turned(up, cosine, 2.0 * math.pi * rng.random())
+        put_photon(event, x, y, z, first, ELECTRON_MASS)
+        second = UnitVector(-first.x, -first.y, -first.z)
+        put_photon(event, x, y, z, second, ELECTRON_MASS)
 
 
 class Medium(NamedTuple):
-    """A crystal, and the tables of photons and electrons in germanium."""
+    """A crystal with its lithium layer, and tables of photons and electrons in germanium."""
 
     outline: Outline
     photons: PhotonTable
     electrons: ElectronTable
-
-    @classmethod
-    def of(cls, detector: Detector) -> Medium:
-        """The crystal of a detector; its lithium layer is treated as germanium."""
-        return cls(outline_of(detector), photon_table(), electron_table())
 
 
 @kernel(error_model="numpy")
@@ -90,7 +283,7 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
         direction = UnitVector(row[3], row[4], row[5])
         while True:
             if energy < PHOTON_CUT:
-                if in_germanium(outline, x, y, z):
+                if in_germanium(outline, x, y, z, 0.0):
                     record(event, x, y, z, energy)
                 break
             at = (math.log(energy) - photons.log_first) * photons.per_log
@@ -104,7 +297,7 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
                 or x * x + y * y > outline.crystal_radius**2
             ):
                 break
-            if not in_germanium(outline, x, y, z):
+            if not in_germanium(outline, x, y, z, 0.0):
                 continue
             place, chance = (x, y, z), rng.random()
             if chance < photons.photoelectric[node]:
@@ -132,78 +325,71 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
 
 
 @kernel(error_model="numpy")
-def way_to_cylinder(
-    outline: Outline, x: float, y: float, z: float, direction: UnitVector
-) -> float:
-    """Distance in mm from a point above the crystal to its enclosing cylinder; -1 if missed."""
-    radius, length = outline.crystal_radius, outline.crystal_length
-    u, v, w = direction
-    if w >= 0.0:
-        return -1.0
-    t = (length - z) / w
-    if (x + t * u) ** 2 + (y + t * v) ** 2 <= radius**2:
-        return t
-    a = u * u + v * v
-    b = x * u + y * v
-    c = x * x + y * y - radius**2
-    inside_root = b * b - a * c
-    if a == 0.0 or inside_root <= 0.0:
-        return -1.0
-    t = (-b - math.sqrt(inside_root)) / a
-    height = z + t * w
-    return t if t > 0.0 and 0.0 <= height <= length else -1.0
-
-
-@kernel(error_model="numpy")
-def emit(outline: Outline, source: SourceDisc, event: Event, rng: np.random.Generator) -> None:
-    """Place a photon where it meets the cylinder of the crystal; none if it misses."""
-    r = source.radius * math.sqrt(rng.random())
-    around = 2.0 * math.pi * rng.random()
-    x, y, z = r * math.cos(around), r * math.sin(around), outline.crystal_length + source.height
-    cosine = source.least_cosine + (1.0 - source.least_cosine) * rng.random()
-    down = turned(UnitVector(0.0, 0.0, -1.0), cosine, 2.0 * math.pi * rng.random())
-    way = way_to_cylinder(outline, x, y, z, down)
-    if way >= 0.0:
-        way += 1e-9  # rounding must not leave it just outside, where it would count as lost
-        x, y, z = x + way * down.x, y + way * down.y, z + way * down.z
-        put_photon(event, x, y, z, down, source.energy)
-
-
-class Windows(NamedTuple):
-    """Windows of energy (MeV), and the numbers of events still missing in each."""
-
-    low: Array
-    high: Array
-    missing: Integers
-
-
-@kernel(error_model="numpy")
-def simulate_block(
-    medium: Medium,
-    source: SourceDisc,
-    n_primaries: int,
-    windows: Windows,
+def emit(
+    outline: Outline,
+    source: tuple[float, float, float, float],
+    event: Event,
     rng: np.random.Generator,
-    hits: Array,
-    offsets: Integers,
-    primaries: Integers,
-) -> tuple[int, int, int]:
-    """Simulate until the primaries, the space for hits or the missing events run out.
+) -> None:
+    """Place a photon where it meets the cylinder around the crystal; none if it misses.
 
-    An event counts if it lies in a window that still misses events, or always if there are
-    no windows. Returns the numbers of primaries done, of events chosen, and of events left out
-    because they have more than `MAX_HITS` deposits.
+    The source is a disc above the crystal that emits into a cone about the axis: energy (MeV),
+    height above the crystal and radius (mm), and cosine of the cone's half angle.
+    """
+    energy, height, disc, least_cosine = source
+    radius, length = outline.crystal_radius, outline.crystal_length
+    r = disc * math.sqrt(rng.random())
+    around = 2.0 * math.pi * rng.random()
+    x, y, z = r * math.cos(around), r * math.sin(around), length + height
+    cosine = least_cosine + (1.0 - least_cosine) * rng.random()
+    down = turned(UnitVector(0.0, 0.0, -1.0), cosine, 2.0 * math.pi * rng.random())
+    u, v, w = down
+    if w >= 0.0:
+        return
+    way = (length - z) / w
+    if (x + way * u) ** 2 + (y + way * v) ** 2 > radius**2:  # not on the top: on the side?
+        a = u * u + v * v
+        b = x * u + y * v
+        c = x * x + y * y - radius**2
+        inside_root = b * b - a * c
+        if a == 0.0 or inside_root <= 0.0:
+            return
+        way = (-b - math.sqrt(inside_root)) / a
+        if not (way > 0.0 and 0.0 <= z + way * w <= length):
+            return
+    way += 1e-9  # rounding must not leave it just outside, where it would count as lost
+    put_photon(event, x + way * u, y + way * v, z + way * w, down, energy)
+
+
+@kernel(error_model="numpy")
+def simulate_events(
+    medium: Medium,
+    source: tuple[float, float, float, float],
+    n_primaries: int,
+    windows: Array,
+    missing: Integers,
+    rng: np.random.Generator,
+) -> tuple[Array, Integers, int, int]:
+    """Simulate until the primaries or the missing events run out.
+
+    An event counts if it lies in one of the `windows` (low and high in MeV) of which events
+    are still `missing`, or always if there are no windows. Returns the deposits, the primary
+    and the end of each event, and the numbers of primaries, and of events left out because they
+    have more than `MAX_HITS` deposits.
     """
     photons, counts = np.empty((MAX_PHOTONS, 7)), np.zeros(3, np.int64)
-    n_kept = n_left_out = 0
-    offsets[0] = 0
+    hits, events = np.empty((2 * MAX_HITS, 4)), np.empty((64, 2), np.int64)  # they grow
+    end = n_events = n_left_out = 0
     for primary in range(n_primaries):
-        start = offsets[n_kept]
-        full = len(hits) - start < MAX_HITS or n_kept == len(primaries)
-        if full or (len(windows.missing) > 0 and windows.missing.sum() == 0):
-            return primary, n_kept, n_left_out
+        if len(missing) > 0 and missing.sum() == 0:
+            n_primaries = primary
+            break
+        if len(hits) - end < MAX_HITS:
+            hits = np.concatenate((hits, np.empty_like(hits)))
+        if n_events == len(events):
+            events = np.concatenate((events, np.empty_like(events)))
         counts[:] = 0
-        event = Event(hits[start : start + MAX_HITS], photons, counts)
+        event = Event(hits[end : end + MAX_HITS], photons, counts)
         emit(medium.outline, source, event, rng)
         follow_photons(medium, event, rng)
         if counts[LOST] > 0:
@@ -214,25 +400,21 @@ def simulate_block(
             energy += event.hits[i, 3]
         if energy == 0.0:
             continue
-        keep = len(windows.missing) == 0
-        for line in range(len(windows.missing)):
-            within = windows.low[line] <= energy <= windows.high[line]
-            if windows.missing[line] > 0 and within:
-                windows.missing[line] -= 1
+        keep = len(missing) == 0
+        for line in range(len(missing)):
+            if missing[line] > 0 and windows[line, 0] <= energy <= windows[line, 1]:
+                missing[line] -= 1
                 keep = True
                 break
         if keep:
-            primaries[n_kept] = primary
-            n_kept += 1
-            offsets[n_kept] = start + counts[HITS]
-    return n_primaries, n_kept, n_left_out
+            end += counts[HITS]
+            events[n_events, :] = (primary, end)
+            n_events += 1
+    return hits[:end], events[:n_events], n_primaries, n_left_out
 
 
 TL208_KEV = 2614.511
 """Energy of the gamma line of Tl-208 in keV."""
-
-_BLOCK_HITS = 1_000_000
-_BLOCK_EVENTS = 20_000
 
 
 class EnergyWindow(NamedTuple):
@@ -301,36 +483,21 @@ def simulate_gammas(
                 f"{line.name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
                 f"the {energy_kev} keV line; give another"
             )
-    medium = Medium.of(detector)
-    reach = detector.crystal_radius + source_radius_mm
-    cosine = source_height_mm / math.hypot(source_height_mm, reach)
-    source = SourceDisc(
-        energy_kev / 1e3, float(source_height_mm), float(source_radius_mm), cosine
-    )
+    medium = Medium(outline_of(detector), photon_table(), electron_table())
+    height, radius = float(source_height_mm), float(source_radius_mm)
+    cosine = height / math.hypot(height, detector.crystal_radius + radius)
+    source = energy_kev / 1e3, height, radius, cosine
     # the sum of deposits equals the energy of the line only up to rounding
-    low = np.array([line.low_kev / 1e3 - 1e-9 for line in wanted])
-    high = np.array([line.high_kev / 1e3 + 1e-9 for line in wanted])
-    missing = np.array(list(wanted.values()), np.int64)
-    windows = Windows(low, high, missing)
+    edges = [(line.low_kev / 1e3 - 1e-9, line.high_kev / 1e3 + 1e-9) for line in wanted]
+    windows, missing = np.array(edges).reshape(-1, 2), np.array([*wanted.values()], np.int64)
     rng = np.random.default_rng(seed)
-    hits = np.empty((min(_BLOCK_HITS, MAX_HITS + 300 * n_primaries), 4))
-    offsets = np.zeros(_BLOCK_EVENTS + 1, np.int64)
-    primaries = np.empty(_BLOCK_EVENTS, np.int64)
-    blocks: list[Hits] = [Hits.of([], [], [0])]
-    done = left_out = 0
-    while done < n_primaries and not (wanted and missing.sum() == 0):
-        tried, n_chosen, large = simulate_block(
-            medium, source, n_primaries - done, windows, rng, hits, offsets, primaries
-        )
-        ends = offsets[: n_chosen + 1].copy()
-        deposits = hits[: ends[-1]]
-        blocks.append(
-            Hits.of(deposits[:, :3], deposits[:, 3] * 1e3, ends, primaries[:n_chosen] + done)
-        )
-        done, left_out = done + tried, left_out + large
+    deposits, events, done, left_out = simulate_events(
+        medium, source, n_primaries, windows, missing, rng
+    )
     if left_out:
         log.warning(f"{left_out} events have more than {MAX_HITS} deposits and are left out")
     if missing.any():
         short = ", ".join(f"{n} of {w.name}" for w, n in zip(wanted, missing, strict=True) if n)
         raise CpunetError(f"{n_primaries} gammas were not enough: {short} missing; allow more")
-    return Hits.concatenate(blocks), done
+    offsets = np.append(0, events[:, 1])
+    return Hits.of(deposits[:, :3], deposits[:, 3] * 1e3, offsets, events[:, 0]), done
