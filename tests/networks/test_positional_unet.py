@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from cpunet.networks.positional_unet import PositionalUNet, positional_map
+from cpunet.networks.positional_unet import PositionalMap, PositionalUNet
 from cpunet.recipes.schema import PunetConfig
 from synthetic import load_recipe
 
@@ -28,7 +28,7 @@ def test_the_paper_network_has_the_published_number_of_parameters():
     ("channels", "samples", "offset"), [(2, 5, 0), (8, 50, 0), (12, 100, 24), (40, 400, 80)]
 )
 def test_positional_map_against_the_formula(channels, samples, offset):
-    values = positional_map(channels, samples, offset)
+    values = PositionalMap(channels, samples, offset, 0.0).values
     assert values.shape == (1, channels, samples)
     for channel in range(channels):
         frequency = 10000.0 ** (-(channel - channel % 2) / channels)

@@ -206,10 +206,14 @@ class BaselineNoise:
         # Twice as long as needed, so that its end is independent of its beginning.
         long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
         each = max(1, (long - length) // length)  # parts of a trace, with a gap at its end
-        continua = self.density[np.newaxis] if self.kinds is None else self.kinds
-        shares = np.ones(1) if self.shares is None else self.shares
-        size = _sizes(self._at(continua, long), long)
-        lines = None if self.lines is None else _sizes(self._lines_at(long), long)
+        continua, lines, shares = self.at(long)
+        # variances of the real and imaginary parts of FFT bins
+        variances = 0.5 * long * np.stack([continua, lines])
+        # these bins are real: all their power is in the real part
+        variances[..., 0] *= 2
+        if long % 2 == 0:
+            variances[..., -1] *= 2
+        size, lines = np.sqrt(variances).astype(np.float32)
         noise = np.empty((n, length), np.float32)
         order = rng.permutation(n)
         # each kind as often as among the baselines, in random order
@@ -221,12 +225,12 @@ class BaselineNoise:
             shape = (len(kind), 2 * size.shape[1])
             bins = rng.standard_normal(shape, np.float32).view(np.complex64)
             bins *= size[kind]
-            if lines is not None:
-                # sines of random phase: of fixed amplitude, the RMS modulus of a Gaussian bin
-                trace, column = np.nonzero(lines[kind])
-                phase = rng.uniform(0, 2 * np.pi, len(trace))
-                heights = np.sqrt(2) * lines[kind][trace, column]
-                bins[trace, column] += heights * np.exp(1j * phase)
+            # lines are sines of random phase: of fixed amplitude, the RMS modulus of a
+            # Gaussian bin
+            trace, column = np.nonzero(lines[kind])
+            phase = rng.uniform(0, 2 * np.pi, len(trace))
+            heights = np.sqrt(2) * lines[kind][trace, column]
+            bins[trace, column] += heights * np.exp(1j * phase)
             traces = scipy.fft.irfft(bins, long, axis=1, overwrite_x=True)
             noise[rows] = traces[:, : each * length].reshape(-1, length)[: len(rows)]
         noise *= (rng.choice((-1.0, 1.0), n) / energy_kev)[:, np.newaxis]
@@ -234,35 +238,23 @@ class BaselineNoise:
 
     def density_of(self, length: int) -> Values:
         """Density at the frequencies of a real FFT of `length` samples, shape ``(bins,)``."""
-        return np.asarray(self._at(self.density[np.newaxis], length)[0], float)
+        return replace(self, kinds=None).at(length)[0][0]
 
-    def _at(self, densities: Values, length: int) -> Values:
-        frequency = np.arange(densities.shape[1]) / self.samples
-        wanted = np.arange(length // 2 + 1) / length
-        if len(wanted) == len(frequency):
-            return densities
-        return np.asarray(
-            [np.interp(wanted, frequency, density) for density in densities], float
-        )
+    def at(self, length: int) -> tuple[Values, Values, Values]:
+        """Continua and lines of all kinds, shape ``(kinds, bins)``, and share of each kind.
 
-    def _lines_at(self, length: int) -> Values:
-        """Lines at the frequencies of an FFT of `length` samples: each stays in one bin."""
-        assert self.lines is not None
-        moved = np.zeros((len(self.lines), length // 2 + 1))
+        The bins are those of a real FFT of `length` samples. A line stays in a single bin.
+        """
+        own = self.density[np.newaxis] if self.kinds is None else self.kinds
+        at, frequency = np.arange(length // 2 + 1) / length, np.arange(own.shape[1])
+        continua = np.array([np.interp(at, frequency / self.samples, kind) for kind in own])
+        lines, longer = np.zeros_like(continua), length / self.samples
+        if self.lines is None or self.shares is None or self.kinds is None:
+            return continua, lines, np.ones(1)
         kind, place = np.nonzero(self.lines)
-        nearest = np.rint(place * (length / self.samples)).astype(int)
-        np.add.at(moved, (kind, nearest), self.lines[kind, place] * (length / self.samples))
-        return moved
-
-
-def _sizes(densities: Values, long: int) -> FloatArray:
-    """Standard deviation of the real and imaginary parts of FFT bins of `long` samples."""
-    variances = 0.5 * long * densities
-    # these bins are real: all their power is in the real part
-    variances[:, 0] *= 2
-    if long % 2 == 0:
-        variances[:, -1] *= 2
-    return np.asarray(np.sqrt(variances), np.float32)
+        nearest = np.rint(place * longer).astype(int)
+        np.add.at(lines, (kind, nearest), self.lines[kind, place] * longer)
+        return continua, lines, self.shares
 
 
 def require_energies(energy_kev: npt.NDArray[np.float64]) -> None:
