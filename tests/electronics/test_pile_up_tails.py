@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -11,13 +12,14 @@ import pytest
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.drawn_pile_up import SIZES_KEV, DrawnTails, TraceNoise, passing
-from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines, tail_shape
+from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
 from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.electronics.tails_law import (
     TailsLaw,
     characteristic_exponents,
     energies_at,
     fit_rate,
+    tail_shape,
 )
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
@@ -104,7 +106,7 @@ def test_each_trace_has_its_tail(busy: RawTraces, found: PileUpTails):
     alone = np.isfinite(found.kev) & (busy.n_piled == 0)
     off = (found.kev - busy.tails_kev)[alone & (busy.tails_kev < 50)]
     assert abs(np.median(off)) < 0.3
-    assert 1.4826 * np.median(np.abs(off)) == pytest.approx(found.error_kev, rel=0.1)
+    assert 1.4826 * np.median(np.abs(off)) == pytest.approx(found.fit.sigma_kev, rel=0.1)
     large = alone & (busy.tails_kev > 100)
     # heights of pulses, not their charge, are the scale: 1.5 % less of `ornl`
     assert np.median(found.kev[large] / busy.tails_kev[large]) == pytest.approx(1, abs=0.02)
@@ -112,7 +114,7 @@ def test_each_trace_has_its_tail(busy: RawTraces, found: PileUpTails):
 
 
 def test_the_decay_is_that_of_the_slowest(found: PileUpTails):
-    assert found.coupled
+    assert found.level_weight
     assert found.decay_error_us is not None
     # tails within the window are 25 % steeper, by the decay of 2.9 us
     assert found.decay_us == pytest.approx(54.6, rel=0.01)
@@ -158,15 +160,15 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     lost = 8000 + raw.waveforms - raw.waveforms[:, :400].mean(axis=1, keepdims=True)
     blocks = [raw.with_waveforms(lost.astype(np.float32))]
     found = PileUpTails.of(Baselines.of(blocks, PREPARATION), decay_us=54.6)
-    assert not found.coupled
+    assert not found.level_weight
     assert found.describe().told_by == "slope"
     large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.tails_kev > 100)
     ratio = np.median(found.kev[large] / busy.tails_kev[large])
     assert ratio == pytest.approx(1, abs=0.1)
     # noise is measured where slopes are negative: it has all its power, and few tails
     empty = found.empty(blocks[0])
-    assert (busy.tails_kev[empty] > found.error_kev).mean() < 0.05
-    told = np.isfinite(found.kev) & (busy.tails_kev < 0.2 * found.error_kev)
+    assert (busy.tails_kev[empty] > found.fit.sigma_kev).mean() < 0.05
+    told = np.isfinite(found.kev) & (busy.tails_kev < 0.2 * found.fit.sigma_kev)
     square, alone = found.kev[told & empty] ** 2, found.kev[told] ** 2
     assert square.mean() == pytest.approx(alone.mean(), rel=0.15)
 
@@ -203,7 +205,7 @@ def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: st
 RECIPE = load_recipe("fast")
 LAW = TailsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)
 BELOW_30 = tuple(float(kev < 30) for kev in SIZES_KEV)
-DRAWN = DrawnTails(LAW, 0.9, 0.5, 16.0, BELOW_30)
+DRAWN = DrawnTails(**asdict(LAW), height=0.9, lead_us=0.5, dt_ns=16.0, passed=BELOW_30)
 
 
 def test_what_cuts_take_is_not_drawn():
@@ -217,8 +219,7 @@ def test_what_cuts_take_is_not_drawn():
     assert ((kev > 5) & (kev < 20)).mean() == pytest.approx(share / len(kev) / passed, rel=0.06)
     busy = DRAWN.uncut(20.0)  # another rate is without cuts
     assert busy.draw_kev(4000, rng).mean() == pytest.approx(10 * mean_kev(LAW), rel=0.1)
-    again = DrawnTails.of(json.loads(json.dumps(DRAWN.describe())))
-    assert again.describe() == DRAWN.describe()
+    assert asdict(DrawnTails.of(json.loads(json.dumps(asdict(DRAWN))))) == asdict(DRAWN)
 
 
 def test_records_get_noise_and_tails_in_proportion_to_their_energies():
@@ -252,7 +253,7 @@ def test_what_passes_is_measured_by_adding_tails_to_traces_without():
     assert passed is not None
     assert passed[0] == 1
     assert passed[-1] == 0
-    drawn = DrawnTails(found.fit.law, 0.9, 0.0, 16.0, passed)
+    drawn = DrawnTails(**asdict(found.fit.law), height=0.9, lead_us=0, dt_ns=16, passed=passed)
     kev, true = drawn.draw_kev(20_000, rng), traces.tails_kev[kept.index]
     for size in (3, 10, 20):
         assert (kev > size).mean() == pytest.approx((true > size).mean(), abs=0.02)

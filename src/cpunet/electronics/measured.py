@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import PreparationConfig
+from cpunet.settings import plain
 
 log = logging.getLogger(__name__)
 
@@ -47,16 +49,17 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
         log.info(f"pile-up tails are not measured: {reason}")
         return TraceNoise(noise_of(data)), TailsInfo(missing=reason)
     drawn = drawn_like(pile_up, data, config)
-    info = pile_up.describe().model_copy(update={"drawn": drawn.describe()})
-    if pile_up.law is not None:
-        tenth = info.percent_above["10_kev"]["measured"]
-        alone = "" if pile_up.coupled else " (by slopes alone: levels do not follow the tilts)"
-        log.info(
-            f"pile-up tails: {pile_up.law.rate_khz:.2f} ± {pile_up.fit.rate_error_khz:.2f} "
-            f"kHz{alone}, {tenth:.2g} % of the traces above 10 keV; translations are "
-            "given them"
-        )
-    return TraceNoise(noise_of(data, pile_up), drawn if pile_up.law else None), info
+    info = pile_up.describe().model_copy(update={"drawn": plain(asdict(drawn))})
+    if pile_up.law is None:
+        return TraceNoise(noise_of(data, pile_up)), info
+    slopes = " (by slopes alone: levels do not follow the tilts)"
+    log.info(
+        f"pile-up tails: {info.rate_khz:.2f} ± {info.rate_error_khz:.2f} kHz"
+        f"{'' if pile_up.level_weight else slopes}, "
+        f"{info.percent_above['10_kev']['measured']:.2g} % of the traces above 10 keV; "
+        "translations are given them"
+    )
+    return TraceNoise(noise_of(data, pile_up), drawn), info
 
 
 def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
@@ -86,7 +89,7 @@ def drawn_like(tails: PileUpTails, data: InputSet, config: PreparationConfig) ->
     if data.cuts is not None and whole is not None and tails.law is not None:
         passed = passing(tails, whole, config, data.cuts)
     return DrawnTails(
-        law=tails.fit.law,
+        **asdict(tails.fit.law),
         height=float(np.median(windows.max(axis=1))),
         lead_us=begins * data.dt_ns * 1e-3,
         dt_ns=data.dt_ns,
@@ -105,8 +108,7 @@ def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
     CpunetError
         If the baselines are too few or too short.
     """
-    baselines = _baselines(data)
-    first = baselines.first
+    first = (baselines := _baselines(data)).first
     usable = np.isfinite(first.energy_kev) & (first.energy_kev > 0)
     usable[NOISE_TRACES:] = False
     if tails is not None and tails.law is not None:

@@ -245,7 +245,7 @@ class Run(InfoPart):
         drawn = DrawnTails.of(tails.drawn)
         if tails.rate_khz > 0:
             return drawn
-        return replace(drawn, law=replace(drawn.law, rate_khz=0.0))
+        return replace(drawn, rate_khz=0.0)
 
     @cached_property
     def records(self) -> list[Record]:

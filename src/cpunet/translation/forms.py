@@ -73,7 +73,7 @@ class Form:
         self.energies_kev: tuple[float, ...] = ()  # of piled-up pulses
         if rate_khz:
             learned = _tails_of(translator, f"`pile_up_khz` {rate_khz:g}")
-            self.energies_kev = learned.law.energies_kev
+            self.energies_kev = learned.energies_kev
         self.n_pre, self.length = config.samples_before, config.length
         self.scale: tuple[float, float] | None = None
         self.ends, self.samples = (0, HIGHEST), np.dtype(np.float32)
@@ -292,7 +292,7 @@ def wanted_tails(
         tails = tails.uncut(rate)
     elif raw:
         tails = tails.uncut()
-    return tails if tails.law.rate_khz > 0 else None
+    return tails if tails.rate_khz > 0 else None
 
 
 def _tails_of(translator: Translator, asked: str) -> DrawnTails:

@@ -191,7 +191,7 @@ def fit_baseline_methods(
     """
     config, result = recipe.preparation, FittedBaselineMethods()
     kinds = BASELINE_METHODS if fitted else {}
-    with_tails = tails is not None and tails.law.rate_khz > 0
+    with_tails = tails is not None and tails.rate_khz > 0
     measured_tails = tails_of(data)[0] if with_tails else None
     try:
         noise = noise_of(data, measured_tails)
