@@ -16,8 +16,6 @@ from cpunet.electronics.superpulses import (
     BASELINE_METHODS,
     LEAD_NS,
     crossing,
-    fit_gauss_exp,
-    fit_rc_late,
     fit_superpulse,
     gauss_exp,
 )
@@ -108,7 +106,9 @@ def other_fine() -> FloatArray:
 )
 def test_gauss_exp_recovers_its_widths(sim, other_fine, sigma_ns, tau_ns) -> None:
     response = sampled(convolved(other_fine, gauss_exp_kernel(sigma_ns, tau_ns)))
-    method = fit_gauss_exp(sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN)
+    method = BASELINE_METHODS["gauss_exp"](
+        sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN
+    )
     assert method.values["sigma_ns"] == pytest.approx(sigma_ns, rel=0.03)
     assert method.values["tau_ns"] == pytest.approx(tau_ns, rel=0.03)
     assert method.tail_slope_per_ms == pytest.approx(-1e6 / DECAY_NS, rel=0.01)
@@ -191,7 +191,7 @@ def test_rc_with_late_charge_recovers_its_parts(sim, other_fine) -> None:
         0.93 * (time == 0) / FINE_NS + 0.07 * np.exp(-time / 500) / 500,
     )[: len(time)]
     data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
-    found = fit_rc_late(sim, data, DT_NS, ALIGN)
+    found = BASELINE_METHODS["rc_late"](sim, data, DT_NS, ALIGN)
     assert found.values["tau_ns"] == pytest.approx(60, rel=0.1)
     assert found.values["late_share"] == pytest.approx(0.07, abs=0.015)
     assert found.values["late_ns"] == pytest.approx(500, rel=0.35)

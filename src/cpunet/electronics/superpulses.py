@@ -5,7 +5,7 @@ Simulated and measured pulses are of different events, so single pulses cannot b
 Their means can, once both datasets are divided at the same quantiles of rise time. Pulses of
 one slice then originate from the same regions of the detector.
 
-`fit_gauss_exp` is the method of LEGEND's production: sigma and tau are fitted to the
+`gauss_exp` is the kernel of LEGEND's production: sigma and tau are fitted to the
 superpulses. `fit_superpulse` divides their spectra. In each slice the mean measured current is
 the mean simulated one convolved with the kernel. The transfer function of the kernel is
 therefore the ratio of their spectra, H = sum(D S*) / sum(|S|^2) over the slices. A Wiener
@@ -14,7 +14,7 @@ factor suppresses H where the measured spectrum does not exceed its statistical 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -37,8 +37,6 @@ from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import last_below
-
-Groups = list[npt.NDArray[np.int64]]
 
 SLICES = 8
 SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is used
@@ -64,7 +62,7 @@ def crossing(steps: Values, fraction: float) -> Values:
     return np.asarray(np.where(crossed, last + (fraction - low) / rise, np.nan), float)
 
 
-def slices(current: Values) -> Groups:
+def slices(current: Values) -> list[npt.NDArray[np.int64]]:
     """Rows of single-site-like pulses between quantiles of rise time.
 
     The pulses with the highest current in each slice are used. They differ far less from
@@ -97,10 +95,10 @@ def slices(current: Values) -> Groups:
     ]
 
 
-def superpulses(spectra: Spectrum, response: Values) -> tuple[Spectrum, Values]:
-    r"""Mean current spectra by slice, with the half maximum of each pulse at sample 0.
+def aligned(spectra: Spectrum, response: Values) -> Spectrum:
+    r"""Current spectra of pulses, with the half maximum of each at sample 0.
 
-    .. math:: \bar{X}_k = \frac{1}{n} \sum_p X_{pk}\, e^{2 \pi i k t_p / N}
+    .. math:: X_{pk}\, e^{2 \pi i k t_p / N}
 
     with the half maximum :math:`t_p` of pulse :math:`p` in samples.
 
@@ -109,154 +107,109 @@ def superpulses(spectra: Spectrum, response: Values) -> tuple[Spectrum, Values]:
     spectra
         Spectra of the currents, shape ``(n, length // 2 + 1)``.
     response
-        The currents that slice and align the pulses.
-
-    Returns
-    -------
-    means, error
-        Shape ``(slices, frequencies)``; the error is the squared standard error of the mean,
-        with noise and the differences between pulses within a slice.
+        The currents that align the pulses, shape ``(n, length)``.
     """
-    groups = slices(response)
-    means = np.empty((len(groups), spectra.shape[1]), complex)
-    error = np.empty(means.shape)
-    for k, moved in enumerate(_aligned(spectra, np.cumsum(response, axis=1), groups)):
-        means[k] = moved.mean(axis=0)
-        error[k] = moved.var(axis=0) / max(1, len(moved) - 1)
-    return means, error
-
-
-def _aligned(spectra: Spectrum, steps: Values, groups: Groups) -> Iterator[Spectrum]:
-    """Current spectra of each slice, with the half maximum of each pulse at sample 0."""
-    half_times, bins = crossing(steps, 0.5), spectra.shape[1]
-    turn, root = 2j * np.pi / steps.shape[1], int(np.ceil(np.sqrt(bins)))
-    for rows in groups:
-        # the phase of bin a + root b is the product of two: far fewer exponentials
-        times = half_times[rows, np.newaxis] * turn
-        fine, coarse = (np.exp(times * step * np.arange(root)) for step in (1, root))
-        phases = coarse[:, :, np.newaxis] * fine[:, np.newaxis]
-        yield spectra[rows] * phases.reshape(len(rows), -1)[:, :bins]
+    (n, length), bins = response.shape, spectra.shape[1]
+    times = crossing(np.cumsum(response, axis=1), 0.5)[:, np.newaxis] * (2j * np.pi / length)
+    # the phase of bin a + root b is the product of two: far fewer exponentials
+    root = int(np.ceil(np.sqrt(bins)))
+    fine, coarse = (np.exp(times * step * np.arange(root)) for step in (1, root))
+    phases = coarse[:, :, np.newaxis] * fine[:, np.newaxis]
+    return np.asarray(spectra * phases.reshape(n, -1)[:, :bins])
 
 
 # maximum number of pulses of either dataset in the fit of parameters, and its iterations,
 # each with slices from the response fitted so far
 FITTED_PULSES, FITTED_ROUNDS = 2000, 3
-# Time compared before and after the half maximum; initial sigma and tau.
-EDGE_NS, START_NS = 1536.0, 32.0
-START_SHARE, LATE_NS = 0.05, 400.0  # the same of the late charge
-
-
-def fit_gauss_exp(
-    sim: FloatArray, data: FloatArray, dt_ns: float, align: int
-) -> BaselineMethod:
-    r"""A Gaussian and an exponential kernel, fitted to superpulses.
-
-    .. math:: H(\omega) = \frac{e^{-\sigma^2 \omega^2 / 2}}{1 + i \omega \tau}
-
-    For the parameters see `fitted_decay`.
-    """
-    scale = {"sigma_ns": LONGEST_NS, "tau_ns": LONGEST_NS}
-    high, start = np.full(2, LONGEST_NS), np.full(2, START_NS)
-    return _fitted(sim, data, dt_ns, align, gauss_exp, start, high, scale)
+EDGE_NS = 1536.0  # time compared before and after the half maximum
 
 
 def gauss_exp(dt_ns: float, sigma_ns: float, tau_ns: float, length: int) -> Spectrum:
-    """Transfer function of `fit_gauss_exp` at the frequencies of a record."""
+    r"""A Gaussian and an exponential, at the frequencies of a record.
+
+    .. math:: H(\omega) = \frac{e^{-\sigma^2 \omega^2 / 2}}{1 + i \omega \tau}
+    """
     omega = 2e-3 * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
     gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
     return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
 
 
-def fit_rc_late(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> BaselineMethod:
-    r"""An RC integration with a part of the charge that comes late, fitted to superpulses.
+def rc_late(
+    dt_ns: float, tau_ns: float, late_share: float, late_ns: float, length: int
+) -> Spectrum:
+    r"""An RC integration with a part of the charge that comes late.
 
     .. math:: H(\omega) = \frac{1}{1 + i \omega \tau}
         \left(1 - w + \frac{w}{1 + i \omega T}\right)
 
-    with the share :math:`w` of the late charge and its time constant :math:`T`. Charges are
-    compared, since late charge counts for little in currents. For the parameters see
-    `fitted_decay`.
+    with the share :math:`w` of the late charge and its time constant :math:`T`.
     """
-    scale = {"tau_ns": LONGEST_NS, "late_share": 1.0, "late_ns": LONGEST_NS}
-    start = np.array([START_NS, START_SHARE, LATE_NS])
-    high = np.array([LONGEST_NS, 0.5, 4 * LONGEST_NS])
-    method = _fitted(sim, data, dt_ns, align, rc_late, start, high, scale, charge=True)
-    return _with_own_decay(method, sim[:FITTED_PULSES], align)
-
-
-def rc_late(
-    dt_ns: float, tau_ns: float, late_share: float, late_ns: float, length: int
-) -> Spectrum:
-    """Transfer function of `fit_rc_late` at the frequencies of a record."""
     s = 2e-3j * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
     late = late_share / (1 + s * late_ns)
     return np.asarray((1 - late_share + late) / (1 + s * tau_ns), complex)
 
 
-def _fitted(
+def fit_kernel(
+    transfer: Callable[..., Spectrum],
+    parameters: Mapping[str, tuple[float, float, float]],
     sim: FloatArray,
     data: FloatArray,
     dt_ns: float,
     align: int,
-    transfer: Callable[..., Spectrum],
-    best: Values,
-    high: Values,
-    scale: Mapping[str, float],
     *,
-    charge: bool = False,
+    late: bool = False,
 ) -> BaselineMethod:
-    """A method whose kernel has parameters, fitted to superpulses.
+    """A kernel with parameters, fitted to superpulses.
 
     Parameters
     ----------
-    sim, data, dt_ns, align
-        See `fitted_decay`.
     transfer
         Transfer function: a function of the period in ns, the parameters and the length.
-    best, high, scale
-        Where the parameters start, their largest values (the smallest are 0), and their
-        scales by name.
-    charge
-        Compare charges in place of currents.
+    parameters
+        Where each starts, its largest value (the smallest is 0), and its scale, by name.
+    sim, data, dt_ns, align
+        See `fitted_decay`.
+    late
+        Whether a part of the charge comes late. It counts for little in currents, so charges
+        are compared; and it contributes to the tail.
     """
+    (best, high, scale), names = np.transpose([*parameters.values()]), [*parameters]
     slope, steps = fitted_decay(sim, data, dt_ns, align, FITTED_PULSES)
     measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
     length = record_length(sim.shape[1], dt_ns)
 
-    def mean_currents(spectra: Spectrum, groups: Groups) -> Values:
-        """Superpulses of currents around the half maximum, shape ``(slices, 2 * edge)``."""
-        steps = np.cumsum(scipy.fft.irfft(spectra, length, axis=1), axis=1)
-        means = [moved.mean(axis=0) for moved in _aligned(spectra, steps, groups)]
-        around = np.roll(scipy.fft.irfft(np.array(means), length, axis=1), edge, axis=1)
+    def superpulses(parts: Sequence[Spectrum], kernel: Spectrum | float = 1.0) -> Values:
+        """Mean currents of slices around the half maximum, shape ``(slices, 2 * edge)``."""
+        behind = [part * kernel for part in parts]
+        moved = [aligned(part, scipy.fft.irfft(part, length, axis=1)) for part in behind]
+        means = np.array([part.mean(axis=0) for part in moved])
+        around = np.roll(scipy.fft.irfft(means, length, axis=1), edge, axis=1)
         return np.asarray(around[:, : 2 * edge], float)
 
-    of_data = np.asarray(scipy.fft.rfft(measured, axis=1), complex)
-    wanted = mean_currents(of_data, slices(measured))
-    spectra = np.asarray(scipy.fft.rfft(currents(sim[:FITTED_PULSES], dt_ns), axis=1), complex)
+    def residual(at: Values, parts: Sequence[Spectrum]) -> Values:
+        off = superpulses(parts, transfer(dt_ns, *at, length)) - wanted
+        return np.asarray(np.cumsum(off, axis=1) if late else off).ravel()
+
+    of_data, of_sim = (
+        np.asarray(scipy.fft.rfft(current, axis=1), complex)
+        for current in (measured, currents(sim[:FITTED_PULSES], dt_ns))
+    )
+    wanted = superpulses([of_data[rows] for rows in slices(measured)])
     for _ in range(FITTED_ROUNDS):
-        response = spectra * transfer(dt_ns, *best, length)
-        groups = slices(scipy.fft.irfft(response, length, axis=1))
-        # pulses outside the slices do not enter the fit
-        sliced = spectra[np.concatenate(groups)]
-        ends = np.cumsum([len(group) for group in groups])
-        places = np.split(np.arange(ends[-1]), ends[:-1])
-
-        def residual(
-            parameters: Values, sliced: Spectrum = sliced, places: Groups = places
-        ) -> Values:
-            off = mean_currents(sliced * transfer(dt_ns, *parameters, length), places) - wanted
-            return np.asarray(np.cumsum(off, axis=1) if charge else off).ravel()
-
+        response = of_sim * transfer(dt_ns, *best, length)
+        sliced = [of_sim[rows] for rows in slices(scipy.fft.irfft(response, length, axis=1))]
         best = scipy.optimize.least_squares(
             residual,
             best,
             bounds=(0.0, high),
-            x_scale=[*scale.values()],
+            x_scale=scale,
             diff_step=1e-3,
             xtol=1e-4,
+            args=(sliced,),
         ).x
-    values = dict(zip(scale, best.tolist(), strict=True))
-    return BaselineMethod(dt_ns, slope, partial(transfer, dt_ns, *values.values()), values)
+    values = dict(zip(names, best.tolist(), strict=True))
+    method = BaselineMethod(dt_ns, slope, partial(transfer, dt_ns, *values.values()), values)
+    return _with_own_decay(method, sim[:FITTED_PULSES], align) if late else method
 
 
 def _with_own_decay(method: BaselineMethod, sim: FloatArray, align: int) -> BaselineMethod:
@@ -267,7 +220,7 @@ def _with_own_decay(method: BaselineMethod, sim: FloatArray, align: int) -> Base
     return replace(method, tail_slope_per_ms=slope - added)
 
 
-# the same of the free kernel, whose iterations take half maxima of the response so far
+# The same of the free kernel, whose iterations take half maxima of the response so far.
 FREE_PULSES, FREE_ROUNDS = 4000, 4
 # The kernel before and after the half maximum, and where its ends are tapered.
 LEAD_NS, LAG_NS = 512.0, 4096.0
@@ -288,16 +241,26 @@ def fit_superpulse(
     """
     slope, steps = fitted_decay(sim, data, dt_ns, align, FREE_PULSES)
     length, current = record_length(sim.shape[1], dt_ns), currents(steps, dt_ns)
+
+    def superpulses(spectra: Spectrum, response: Values) -> tuple[Spectrum, Values]:
+        """Mean spectrum of each slice, and its squared standard error.
+
+        The error includes noise and the differences between pulses within a slice.
+        """
+        moved = [aligned(spectra[rows], response[rows]) for rows in slices(response)]
+        error = np.array([part.var(axis=0) / max(1, len(part) - 1) for part in moved])
+        return np.array([part.mean(axis=0) for part in moved]), error
+
     measured, data_error = superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
     wiener = np.clip(1 - data_error.sum(axis=0) / (np.abs(measured) ** 2).sum(axis=0), 0, 1)
     lead, lag, fade_in, fade_out = (
         round(time / dt_ns) for time in (LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS)
     )
     fades = np.ones(lead + lag)
-    fades[:fade_in] = np.sin(0.5 * np.pi * (np.arange(fade_in) + 0.5) / fade_in) ** 2
-    fall = np.sin(0.5 * np.pi * (np.arange(fade_out) + 0.5) / fade_out) ** 2
-    fades[-fade_out:] = fall[::-1]
-
+    begin, end = (
+        np.sin(0.5 * np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in (fade_in, fade_out)
+    )
+    fades[:fade_in], fades[-fade_out:] = begin, end[::-1]
     spectra = np.asarray(scipy.fft.rfft(currents(sim[:FREE_PULSES], dt_ns), axis=1))
     kernel = np.zeros(lead + lag)
     kernel[lead] = 1.0
@@ -329,9 +292,13 @@ def free(kernel: Values, lead: int, length: int) -> Spectrum:
 
 
 Fit = Callable[[FloatArray, FloatArray, float, int], BaselineMethod]
+# Where parameters start, their largest values, and their scales.
+_WIDTH = 32.0, LONGEST_NS, LONGEST_NS
+_LATE = {"tau_ns": _WIDTH, "late_share": (0.05, 0.5, 1.0)}
+_LATE["late_ns"] = 400.0, 4 * LONGEST_NS, LONGEST_NS
 BASELINE_METHODS: dict[str, Fit] = {
     "rc": fit_rc,
-    "rc_late": fit_rc_late,
-    "gauss_exp": fit_gauss_exp,
+    "rc_late": partial(fit_kernel, rc_late, _LATE, late=True),
+    "gauss_exp": partial(fit_kernel, gauss_exp, {"sigma_ns": _WIDTH, "tau_ns": _WIDTH}),
     "superpulse": fit_superpulse,
 }
