@@ -10,15 +10,17 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cpunet.electronics.baseline_methods import BaselineMethod, fit_rc, rc
-from cpunet.electronics.finishing import finish
-from cpunet.electronics.superpulses import (
+from cpunet.electronics.baseline_methods import (
     BASELINE_METHODS,
     LEAD_NS,
+    BaselineMethod,
     crossing,
+    fit_rc,
     fit_superpulse,
     gauss_exp,
+    rc,
 )
+from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
