@@ -133,35 +133,33 @@ class BaselineNoise:
                 f"{MIN_NS:.0f} or more, so give traces with a longer baseline"
             )
         used = baselines.prepared[rows[before >= length]]
-        samples = baselines.first.waveforms[used.index, :length].astype(float)
+        values = baselines.first.waveforms[used.index, :length].astype(float)
         kev, dt_ns = used.pulses.energy_kev / used.scale, baselines.first.dt_ns
-        values = (samples - used.baseline[:, np.newaxis]) * kev[:, np.newaxis]
-        if len(values) and not np.median(np.ptp(values, axis=1)):
+        values = (values - used.baseline[:, np.newaxis]) * kev[:, np.newaxis]
+        if not np.median(np.ptp(values, axis=1)):
             raise CpunetError(
                 "most baselines are constant: there is no noise to learn; give measured traces"
             )
-        flat = values[_flat(values)] if len(values) else values
+        flat = values[_flat(values)]
         if len(flat) < MIN_BASELINES:
             raise CpunetError(
                 f"only {len(flat)} flat baselines among {chosen.sum()} traces; give more "
                 f"traces (at least {MIN_BASELINES} with known energy)"
             )
-        continuum, lines = spectrum(flat, record_samples(dt_ns))
-        mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
+        samples = record_samples(dt_ns)
+        mean = cls(np.add(*spectrum(flat, samples)), samples, dt_ns, len(flat))
         which = _kinds(flat, mean)
         counts = np.bincount(which)
-        spectra = [
-            spectrum(flat[which == kind], record_samples(dt_ns)) for kind in range(len(counts))
-        ]
-        kinds, kinds_lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
+        spectra = [spectrum(flat[which == kind], samples) for kind in range(len(counts))]
+        kinds, lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
         # standard error of an RMS that is partly extrapolated beyond the baselines
         power = flat.var(axis=1)
         seen = float(np.sqrt(power.mean()))
-        chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5) if seen else 0.0
+        chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5)
         return replace(
             mean,
             kinds=kinds,
-            lines=kinds_lines,
+            lines=lines,
             shares=counts / counts.sum(),
             rms_error=float(np.hypot(chance, mean.rms - seen)),
         )
@@ -238,7 +236,7 @@ class BaselineNoise:
 
     def density_of(self, length: int) -> Values:
         """Density at the frequencies of a real FFT of `length` samples, shape ``(bins,)``."""
-        return replace(self, kinds=None).at(length)[0][0]
+        return np.asarray(replace(self, kinds=None).at(length)[0][0], float)
 
     def at(self, length: int) -> tuple[Values, Values, Values]:
         """Continua and lines of all kinds, shape ``(kinds, bins)``, and share of each kind.
@@ -294,10 +292,9 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     # kmeans2 warns of an empty kind, which is harmless: it is left out below
     with warnings.catch_warnings(action="ignore"):
         centres, which = scipy.cluster.vq.kmeans2(points, kinds, minit="++", rng=rng, iter=50)
-    # baselines of kinds with too few are assigned to the nearest kind with enough
+    # baselines of kinds with too few are assigned to the nearest kind with enough: the largest
+    # at least has as many
     enough = np.bincount(which, minlength=kinds) >= MIN_BASELINES
-    if not enough.any():
-        return alike
     return np.asarray(scipy.cluster.vq.vq(points, centres[enough])[0], np.intp)
 
 

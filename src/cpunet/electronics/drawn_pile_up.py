@@ -88,7 +88,8 @@ class DrawnTails(TailsLaw):
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> Self:
         """Read the fields from a mapping with lists in place of tuples, as in JSON."""
-        return cls(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+        tuples: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+        return cls(**tuples)
 
 
 @dataclass(frozen=True, eq=False)

@@ -116,4 +116,4 @@ def moved_apart(taus_ns: Sequence[float]) -> list[float]:
         groups.append((group, moved))
     for group, moved in groups:
         values[group] = moved
-    return values.tolist()
+    return [float(tau) for tau in values]

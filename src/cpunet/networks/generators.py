@@ -37,8 +37,9 @@ class KeptNoise(Stored):
 
     def set_noise(self, noise: BaselineNoise) -> None:
         """Store a measured spectrum."""
-        own = self.noise_continua, self.noise_lines, self.noise_shares
-        for array, values in zip(own, noise.at(record_samples(self.noise_dt_ns)), strict=True):
+        given = noise.at(record_samples(self.noise_dt_ns))
+        own: Any = self.noise_continua, self.noise_lines, self.noise_shares
+        for array, values in zip(own, given, strict=True):
             array[...] = 0
             array[: len(values)] = values
         self.n_baselines[...] = noise.n_baselines
