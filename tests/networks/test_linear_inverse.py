@@ -38,14 +38,6 @@ def test_beyond_the_region_it_is_0_and_1(identity):
     np.testing.assert_allclose(identity(pulses), edges(30), atol=1e-5, rtol=1e-5)
 
 
-def test_the_mean_is_put_in_place_of_what_has_no_weight(identity):
-    identity.weights[...] = 0
-    identity.mean_out[...] = np.linspace(0, 1, 20)
-    result = identity(edges(30))
-    # the half maximum lies after sample 31, where the region has its twelfth sample
-    np.testing.assert_allclose(result[0, 19:39], np.linspace(0, 1, 20), atol=1e-6)
-
-
 def test_a_window_that_is_no_pulse_has_nothing_to_say_to_others(identity):
     pulses = 0.9 * edges(25, 30, 33) + np.float32(0.05)  # of any offset and height
     pulses[1] = float("nan")
