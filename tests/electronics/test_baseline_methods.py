@@ -15,8 +15,6 @@ from cpunet.electronics.baseline_methods import (
     LEAD_NS,
     BaselineMethod,
     crossing,
-    fit_rc,
-    fit_superpulse,
     gauss_exp,
 )
 from cpunet.electronics.finishing import finish
@@ -113,7 +111,7 @@ def test_rc_recovers_its_time_constant(sim, other_fine, tau_ns) -> None:
     """From a period on, behind which pulses are fast enough."""
     rate = DT_NS / tau_ns
     response = scipy.signal.lfilter([0, rate], [1, rate - 1], sampled(other_fine), axis=1)
-    method = fit_rc(sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN)
+    method = BASELINE_METHODS["rc"](sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN)
     assert method.values["tau_ns"] == pytest.approx(tau_ns, rel=0.05)
 
 
@@ -126,7 +124,7 @@ def two_pole_kernel() -> np.ndarray:
 def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
     kernel = two_pole_kernel()
     data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
-    method = fit_superpulse(sim, data, DT_NS, ALIGN)
+    method = BASELINE_METHODS["superpulse"](sim, data, DT_NS, ALIGN)
     kernel_of_method = method.transfer.args[0]
     steps = np.cumsum(kernel_of_method)[np.newaxis]
     time = np.arange(0, 200) * DT_NS
@@ -162,7 +160,7 @@ def test_bad_input_is_named(sim) -> None:
         with pytest.raises(CpunetError, match=r"7 simulated pulses; give \d+ or more"):
             method(sim[:7], sim, DT_NS, ALIGN)
     with pytest.raises(CpunetError, match="check their polarity"):
-        fit_rc(sim, -sim, DT_NS, ALIGN)
+        BASELINE_METHODS["rc"](sim, -sim, DT_NS, ALIGN)
 
 
 def test_rc_with_late_charge_recovers_its_parts(sim, other_fine) -> None:

@@ -40,7 +40,6 @@ Spectrum = npt.NDArray[np.complex128]
 MIN_PULSES = 50  # of either dataset, for a fit
 TAIL_SHARE = 0.75  # of the time after the alignment: 4.8 of 6.4 us, as in the paper
 LONGEST_NS = 1024.0  # maximum sigma and tau
-MAX_PULSES = 4000  # maximum number of pulses in the fit of an RC
 TOLERANCE = 1e-3  # precision of its tau, in samples
 
 
@@ -113,97 +112,93 @@ def currents(windows: FloatArray, dt_ns: float) -> Values:
     return record
 
 
-def fitted_tail_slope(data: FloatArray, dt_ns: float, align: int) -> float:
-    """Median logarithmic slope of the tails, in 1/ms.
-
-    Raises
-    ------
-    CpunetError
-        If no tail is positive.
-    """
-    slopes = tail_slope(data, dt_ns, _tail_samples(data, align))
-    slopes = slopes[np.isfinite(slopes)]
-    if not slopes.size:
-        raise CpunetError("no measured pulse has a positive tail; check their polarity")
-    return float(np.median(slopes))
+Kernel = tuple[Callable[[int], Spectrum], dict[str, float]]
+"""Transfer function at the frequencies of a record, and fitted values by name."""
 
 
-def _tail_samples(windows: FloatArray, align: int) -> int:
-    """Number of samples at the end of windows that contain only the decay."""
-    return max(3, int(TAIL_SHARE * (windows.shape[1] - align)))
-
-
-def fitted_decay(
-    sim: FloatArray, data: FloatArray, dt_ns: float, align: int, most: int
-) -> tuple[float, FloatArray]:
-    r"""Tail slope of the data, and the data without their decay (pole-zero correction).
+def fitted(
+    fit: Callable[[FloatArray, FloatArray, float], Kernel],
+    most: int,
+    sim: FloatArray,
+    data: FloatArray,
+    dt_ns: float,
+    align: int,
+    *,
+    late: bool = False,
+) -> BaselineMethod:
+    r"""Fit the decay, and a kernel to the data without it (pole-zero correction).
 
     .. math:: x_j = \sum_{k \le j} \left(s_k - e^{\lambda \Delta t} s_{k-1}\right)
 
-    with the logarithmic slope :math:`\lambda` of the tail.
+    with the median logarithmic slope :math:`\lambda` of the tails.
 
     Parameters
     ----------
+    fit
+        Fit of the kernel to simulated windows and data without decay, both of unit height, and
+        their sampling period in ns.
+    most
+        Number of pulses at most of either side that are compared.
     sim, data
         Prepared windows, shape ``(n, length)``. Simulated ones range from 0 to 1.
     dt_ns
         Sampling period in ns.
     align
         Sample at which both are aligned.
-    most
-        Number of pulses at most that are corrected.
-
-    Returns
-    -------
-    tuple
-        The slope in 1/ms; pulses of unit height, float32.
+    late
+        Whether the kernel has a late part, which contributes to the tail.
 
     Raises
     ------
     CpunetError
-        If a side has too few pulses, or no tail is positive.
-
-    Examples
-    --------
-    An exponential decay becomes a step.
-
-    >>> decay = np.r_[np.zeros(10), np.exp(-np.arange(30) * 0.016 / 50)]  # 50 us
-    >>> decays = np.repeat(decay[np.newaxis], 50, axis=0)
-    >>> slope, steps = fitted_decay(decays, decays, 16.0, 10, 1)
-    >>> round(slope, 3), steps[0, [9, 10, 39]].round(6).tolist()
-    (-20.0, [0.0, 1.0, 1.0])
+        If a side has too few pulses, or no tail is positive, or the fit of the kernel fails.
     """
     for side, windows in (("simulated", sim), ("measured", data)):
         if len(windows) < MIN_PULSES:
             raise CpunetError(
                 f"{len(windows)} {side} pulses; give {MIN_PULSES} or more to fit a response to"
             )
-    slope = fitted_tail_slope(data, dt_ns, align)
+    length = data.shape[1]
+    late_samples = max(3, int(TAIL_SHARE * (length - align)))  # contain only the decay
+
+    def slope_of(windows: FloatArray) -> float:
+        slopes = tail_slope(windows, dt_ns, late_samples)
+        slopes = slopes[np.isfinite(slopes)]
+        if not slopes.size:
+            raise CpunetError("no measured pulse has a positive tail; check their polarity")
+        return float(np.median(slopes))
+
+    slope = slope_of(data)
     current = data[:most].astype(float)
     current[:, 1:] -= np.exp(slope * dt_ns * 1e-6) * data[:most, :-1]
     steps = np.cumsum(current, axis=1)
-    heights = steps[:, -_tail_samples(data, align) :].mean(axis=1, keepdims=True)
-    return slope, (steps / heights).astype(np.float32)
+    heights = steps[:, -late_samples:].mean(axis=1, keepdims=True)
+    transfer, values = fit(sim[:most], (steps / heights).astype(np.float32), dt_ns)
+    method = BaselineMethod(dt_ns, slope, transfer, values)
+    if not late:
+        return method
+    before = padding(dt_ns)[0]
+    added = slope_of(method.translate(sim[:most])[:, before : before + length]) - slope
+    return replace(method, tail_slope_per_ms=slope - added)
 
 
-def fit_rc(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> BaselineMethod:
+def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
     r"""A single RC integration: match the mode of the current amplitudes.
 
     .. math:: s_j = s_{j-1} + (x_{j-1} - s_{j-1})\, \Delta t / \tau
 
     as in siggen, with :math:`\tau` of at least one sampling period. For the parameters see
-    `fitted_decay`.
+    `fitted`.
 
     Raises
     ------
     CpunetError
-        For the reasons of `fitted_decay`, or if the data are slower than the maximum tau.
+        If the data are slower than the maximum tau.
     """
-    slope, steps = fitted_decay(sim, data, dt_ns, align, MAX_PULSES)
     wanted = most_frequent(current_amplitude(steps, dt_ns))
     before, longest = padding(dt_ns)[0], LONGEST_NS / dt_ns
     window = slice(before, before + sim.shape[1])
-    current = currents(sim[:MAX_PULSES], dt_ns)
+    current = currents(sim, dt_ns)
 
     def excess(tau: float) -> float:
         slower = scipy.signal.lfilter([0.0, 1 / tau], [1.0, 1 / tau - 1.0], current)
@@ -219,7 +214,7 @@ def fit_rc(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Basel
         )
     else:
         tau_ns = dt_ns * float(scipy.optimize.brentq(excess, 1.0, longest, xtol=TOLERANCE))
-    return BaselineMethod(dt_ns, slope, partial(rc, dt_ns, tau_ns), {"tau_ns": tau_ns})
+    return partial(rc, dt_ns, tau_ns), {"tau_ns": tau_ns}
 
 
 def rc(dt_ns: float, tau_ns: float, length: int) -> Spectrum:
@@ -326,9 +321,7 @@ def aligned(spectra: Spectrum, response: Values) -> Spectrum:
     return np.asarray(spectra * phases.reshape(n, -1)[:, :bins])
 
 
-# maximum number of pulses of either dataset in the fit of parameters, and its iterations,
-# each with slices from the response fitted so far
-FITTED_PULSES, FITTED_ROUNDS = 2000, 3
+FITTED_ROUNDS = 3  # of the fit of parameters, each with slices from the response fitted so far
 EDGE_NS = 1536.0  # time compared before and after the half maximum
 
 
@@ -361,12 +354,11 @@ def fit_kernel(
     transfer: Callable[..., Spectrum],
     parameters: Mapping[str, tuple[float, float, float]],
     sim: FloatArray,
-    data: FloatArray,
+    steps: FloatArray,
     dt_ns: float,
-    align: int,
     *,
     late: bool = False,
-) -> BaselineMethod:
+) -> Kernel:
     """A kernel with parameters, fitted to superpulses.
 
     Parameters
@@ -375,14 +367,13 @@ def fit_kernel(
         Transfer function: a function of the period in ns, the parameters and the length.
     parameters
         Where each starts, its largest value (the smallest is 0), and its scale, by name.
-    sim, data, dt_ns, align
-        See `fitted_decay`.
+    sim, steps, dt_ns
+        See `fitted`.
     late
         Whether a part of the charge comes late. It counts for little in currents, so charges
-        are compared; and it contributes to the tail.
+        are compared.
     """
     (best, high, scale), names = np.transpose([*parameters.values()]), [*parameters]
-    slope, steps = fitted_decay(sim, data, dt_ns, align, FITTED_PULSES)
     measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
     length = record_length(sim.shape[1], dt_ns)
 
@@ -400,7 +391,7 @@ def fit_kernel(
 
     of_data, of_sim = (
         np.asarray(scipy.fft.rfft(current, axis=1), complex)
-        for current in (measured, currents(sim[:FITTED_PULSES], dt_ns))
+        for current in (measured, currents(sim, dt_ns))
     )
     wanted = superpulses([of_data[rows] for rows in slices(measured)])
     for _ in range(FITTED_ROUNDS):
@@ -416,28 +407,16 @@ def fit_kernel(
             args=(sliced,),
         ).x
     values = dict(zip(names, best.tolist(), strict=True))
-    method = BaselineMethod(dt_ns, slope, partial(transfer, dt_ns, *values.values()), values)
-    return _with_own_decay(method, sim[:FITTED_PULSES], align) if late else method
+    return partial(transfer, dt_ns, *values.values()), values
 
 
-def _with_own_decay(method: BaselineMethod, sim: FloatArray, align: int) -> BaselineMethod:
-    """A method whose decay lacks what a kernel's late part contributes to the tail."""
-    before, slope = padding(method.dt_ns)[0], method.tail_slope_per_ms
-    windows = method.translate(sim)[:, before : before + sim.shape[1]]
-    added = fitted_tail_slope(windows, method.dt_ns, align) - slope
-    return replace(method, tail_slope_per_ms=slope - added)
-
-
-# The same of the free kernel, whose iterations take half maxima of the response so far.
-FREE_PULSES, FREE_ROUNDS = 4000, 4
+FREE_ROUNDS = 4  # of the free kernel, each with half maxima of the response so far
 # The kernel before and after the half maximum, and where its ends are tapered.
 LEAD_NS, LAG_NS = 512.0, 4096.0
 FADE_IN_NS, FADE_OUT_NS = 128.0, 1024.0
 
 
-def fit_superpulse(
-    sim: FloatArray, data: FloatArray, dt_ns: float, align: int
-) -> BaselineMethod:
+def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
     r"""A free kernel: `LEAD_NS` before zero delay and `LAG_NS` from it on, with a sum of 1.
 
     .. math:: H = W \frac{\sum D S^*}{\sum (|S|^2 + \sigma_S^2)}, \qquad
@@ -445,9 +424,8 @@ def fit_superpulse(
 
     The sums run over the slices. :math:`D` and :math:`S` are the mean spectra of data and
     simulation, :math:`\sigma_D` and :math:`\sigma_S` their statistical errors. For the
-    parameters see `fitted_decay`.
+    parameters see `fitted`.
     """
-    slope, steps = fitted_decay(sim, data, dt_ns, align, FREE_PULSES)
     length, current = record_length(sim.shape[1], dt_ns), currents(steps, dt_ns)
 
     def superpulses(spectra: Spectrum, response: Values) -> tuple[Spectrum, Values]:
@@ -469,7 +447,7 @@ def fit_superpulse(
         np.sin(0.5 * np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in (fade_in, fade_out)
     )
     fades[:fade_in], fades[-fade_out:] = begin, end[::-1]
-    spectra = np.asarray(scipy.fft.rfft(currents(sim[:FREE_PULSES], dt_ns), axis=1))
+    spectra = np.asarray(scipy.fft.rfft(currents(sim, dt_ns), axis=1))
     kernel = np.zeros(lead + lag)
     kernel[lead] = 1.0
     for _ in range(FREE_ROUNDS):
@@ -488,8 +466,7 @@ def fit_superpulse(
         "kernel_mean_ns": mean_ns - LEAD_NS,
         "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
     }
-    method = BaselineMethod(dt_ns, slope, partial(free, kernel, lead), values)
-    return _with_own_decay(method, sim[:FREE_PULSES], align)
+    return partial(free, kernel, lead), values
 
 
 def free(kernel: Values, lead: int, length: int) -> Spectrum:
@@ -499,14 +476,15 @@ def free(kernel: Values, lead: int, length: int) -> Spectrum:
     return np.asarray(scipy.fft.rfft(np.roll(around_zero, -lead)), complex)
 
 
-Fit = Callable[[FloatArray, FloatArray, float, int], BaselineMethod]
 # Where parameters start, their largest values, and their scales.
 _WIDTH = 32.0, LONGEST_NS, LONGEST_NS
-_LATE = {"tau_ns": _WIDTH, "late_share": (0.05, 0.5, 1.0)}
-_LATE["late_ns"] = 400.0, 4 * LONGEST_NS, LONGEST_NS
-BASELINE_METHODS: dict[str, Fit] = {
-    "rc": fit_rc,
-    "rc_late": partial(fit_kernel, rc_late, _LATE, late=True),
-    "gauss_exp": partial(fit_kernel, gauss_exp, {"sigma_ns": _WIDTH, "tau_ns": _WIDTH}),
-    "superpulse": fit_superpulse,
+_GAUSS_EXP = {"sigma_ns": _WIDTH, "tau_ns": _WIDTH}
+_RC_LATE = {"tau_ns": _WIDTH, "late_share": (0.05, 0.5, 1.0)}
+_RC_LATE["late_ns"] = 400.0, 4 * LONGEST_NS, LONGEST_NS
+_rc_late = partial(fit_kernel, rc_late, _RC_LATE, late=True)
+BASELINE_METHODS: dict[str, Callable[[FloatArray, FloatArray, float, int], BaselineMethod]] = {
+    "rc": partial(fitted, fit_rc, 4000),
+    "rc_late": partial(fitted, _rc_late, 2000, late=True),
+    "gauss_exp": partial(fitted, partial(fit_kernel, gauss_exp, _GAUSS_EXP), 2000),
+    "superpulse": partial(fitted, fit_superpulse, 4000, late=True),
 }
