@@ -305,15 +305,21 @@ class RawTraces(Pulses):
     piled_ns: FloatArray
 
 
-def by_height(signal_kev: FloatArray, electronics: Electronics) -> FloatArray:
+def by_height(
+    signal: FloatArray, electronics: Electronics, kev: FloatArray | float = 1.0
+) -> FloatArray:
     """Signals as an amplifier of limited slew rate and a digitiser leave them.
 
     Parameters
     ----------
-    signal_kev
-        Height in keV, shape (pulses, samples).
+    signal
+        Shape ``(pulses, samples)``.
+    kev
+        Height in keV of a signal of 1, a number or of shape ``(pulses, 1)``.
     """
-    result = np.array(signal_kev, float)
+    if electronics.slew_kev_per_ns is None and electronics.nonlinearity is None:
+        return signal
+    result = kev * signal
     if electronics.slew_kev_per_ns is not None:
         limit = electronics.slew_kev_per_ns * electronics.dt_ns
         for i in range(1, result.shape[1]):
@@ -322,17 +328,7 @@ def by_height(signal_kev: FloatArray, electronics: Electronics) -> FloatArray:
     if (off := electronics.nonlinearity) is not None:
         full = electronics.adc_top / electronics.gain_adc_per_kev
         result += off.fraction * full * np.sin(2 * np.pi * off.waves * result / full)
-    return result
-
-
-def of_energy(
-    response: FloatArray, energy_kev: FloatArray, electronics: Electronics
-) -> FloatArray:
-    """Noise-free pulses in units of the charge, with what acts by their height."""
-    if electronics.slew_kev_per_ns is None and electronics.nonlinearity is None:
-        return response
-    kev = energy_kev[:, np.newaxis]
-    return by_height(kev * response, electronics) / kev
+    return result / kev
 
 
 def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
@@ -402,7 +398,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         peak=pulses.peak,
         t0_ns=np.zeros(n),
         flag=flag,
-        response=of_energy(response, energy, electronics).astype(np.float32),
+        response=by_height(response, electronics, energy[:, None]).astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
         tails_kev=tails_kev,

@@ -17,8 +17,8 @@ from cpunet.electronics.readout import (
     DECAYING_BASELINE,
     PILE_UP,
     SATURATED,
+    by_height,
     linear_response,
-    of_energy,
     read_out,
 )
 from cpunet.errors import CpunetError
@@ -309,7 +309,8 @@ def _write_sim(folder: Path, side: Side, electronics: Electronics) -> Labels:
             )
             writer.append(means)
             writer.append_rows(HIT_TABLE, hit_columns(hits))
-            true = of_energy(linear_response(fine, electronics), fine.energy_kev, electronics)
+            true = linear_response(fine, electronics)
+            true = by_height(true, electronics, fine.energy_kev[:, np.newaxis])
             truth.write(true.astype(np.float32).tobytes())
             labels.append(label)
         simulation = {"cpunet": cpunet.__version__, **side.provenance()}

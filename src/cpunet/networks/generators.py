@@ -47,20 +47,12 @@ class KeptNoise(Stored):
     @property
     def noise(self) -> BaselineNoise:
         """The noise, to be drawn from."""
-        present = self.noise_shares > 0
-        continua, lines, shares = (
-            array[present].astype(float)
-            for array in (self.noise_continua, self.noise_lines, self.noise_shares)
-        )
-        return BaselineNoise(
-            shares @ (continua + lines),
-            record_samples(self.noise_dt_ns),
-            self.noise_dt_ns,
-            int(self.n_baselines),
-            continua,
-            lines,
-            shares,
-        )
+        present, dt_ns = self.noise_shares > 0, self.noise_dt_ns
+        stored = self.noise_continua, self.noise_lines, self.noise_shares
+        continua, lines, shares = (array[present].astype(float) for array in stored)
+        mean, n = shares @ (continua + lines), int(self.n_baselines)
+        kinds = continua, lines, shares
+        return BaselineNoise(mean, record_samples(dt_ns), dt_ns, n, *kinds)
 
 
 AFTER_NS = 2720.0  # from the half maximum until charge and slow response have arrived
