@@ -113,17 +113,6 @@ def on_baselines(baselines: np.ndarray, kev: float = 2000.0) -> Pulses:
     return Pulses.of(15_000 + adc, dt_ns=DT_NS, energy_kev=energy)
 
 
-def test_drawn_noise_has_the_density_it_is_drawn_from() -> None:
-    frequency = np.linspace(0, 0.5, GRID // 2 + 1)
-    known = BaselineNoise(4 / (1 + (frequency / 0.05) ** 2) + 0.5, GRID, DT_NS, 100)
-    drawn = known.draw(np.full(1000, 2.0), 1400, np.random.default_rng(4))
-    assert drawn.std() * 2 == pytest.approx(known.rms, rel=0.02)
-    at, found = scipy.signal.welch(drawn * 2.0, nperseg=256, return_onesided=False)
-    positive = at > 0.02
-    wanted = 4 / (1 + (at[positive] / 0.05) ** 2) + 0.5
-    np.testing.assert_allclose(found.mean(axis=0)[positive], wanted, rtol=0.05)
-
-
 def test_noise_slower_than_a_baseline_is_found() -> None:
     baselines = 2 * coloured_noise(SPECTRUM, 1500, 1200, DT_NS, np.random.default_rng(6))
     noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))

@@ -176,12 +176,9 @@ def test_any_shift_is_that_of_the_data(tmp_path: Path) -> None:
 def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
     for settings, said in (
         ({"dt_ns": 0.05}, "dt_ns: Input should be greater than or equal to 1"),
-        ({"dt_ns": 3000}, "dt_ns: Input should be less than or equal to 200"),
         ({"dt_ns": 12.5}, "dt_ns must be a multiple of step_ns, 1 ns; add step_ns=0.5$"),
         ({"dt_ns": 3.001}, "multiple of step_ns, 1 ns; choose another$"),
         ({"step_ns": 8}, "step_ns = 8: a stand needs steps of at most 4 ns; lower it$"),
-        ({"record_ns": 20}, "before_ns must be at least dt_ns and less than record_ns"),
-        ({"earlier_pulses.rate_kHz": 1e300}, "earlier_pulses.rate_kHz: Input should be less"),
         ({"bias": 3}, "bias: no such setting"),
     ):
         with pytest.raises(CpunetError, match=said):
