@@ -22,7 +22,7 @@ from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
-from cpunet.pulses.container import FloatArray, line_slope
+from cpunet.pulses.container import FloatArray, blocks, line_slope
 
 MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory
@@ -140,7 +140,15 @@ class BaselineNoise:
             raise CpunetError(
                 "most baselines are constant: there is no noise to learn; give measured traces"
             )
-        flat = values[_flat(values)]
+        # those that neither slope nor contain another pulse, nor are constant
+        slope = values @ line_slope(length)
+        line = slope[:, np.newaxis] * (np.arange(length) - 0.5 * (length - 1))
+        width, fine = (values - line).std(axis=1), np.ptp(values, axis=1) > 0
+        for _ in range(CLIPS):
+            for off in (np.abs(slope - np.median(slope[fine])), width - np.median(width[fine])):
+                sigma = 1.4826 * np.median(np.abs(off[fine]))
+                fine &= off <= FLAT_SIGMAS * sigma  # quiet baselines are as flat as others
+        flat = values[fine]
         if len(flat) < MIN_BASELINES:
             raise CpunetError(
                 f"only {len(flat)} flat baselines among {chosen.sum()} traces; give more "
@@ -307,19 +315,6 @@ def _band_powers(baselines: Values) -> Values:
     return np.asarray(np.log(np.stack([b.mean(axis=1) for b in bands], axis=1)), float)
 
 
-def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
-    """Select baselines that neither slope nor contain another pulse, nor are constant."""
-    n = baselines.shape[1]
-    slope = baselines @ line_slope(n)
-    width = (baselines - slope[:, np.newaxis] * (np.arange(n) - 0.5 * (n - 1))).std(axis=1)
-    flat = np.asarray(np.ptp(baselines, axis=1) > 0)
-    for _ in range(CLIPS):
-        for off in (np.abs(slope - np.median(slope[flat])), width - np.median(width[flat])):
-            sigma = 1.4826 * np.median(np.abs(off[flat]))
-            flat &= off <= FLAT_SIGMAS * sigma  # quiet baselines are as flat as others
-    return flat
-
-
 def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
     r"""Power spectrum of a set of baselines: mean square per sample and frequency bin.
 
@@ -353,10 +348,10 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
     >>> bool(abs(continuum[1000:].mean() - 4) < 0.1), bool(lines.any())
     (True, False)
     """
-    length = baselines.shape[1]
+    n, length = baselines.shape
     window = np.hanning(length + 1)[:-1]
-    centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
-    power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
+    centred = baselines - baselines.mean(axis=1, keepdims=True)
+    power = np.abs(scipy.fft.rfft(centred * window, axis=1)) ** 2
     density = np.asarray(power.mean(axis=0) / (window @ window), float)
     # split a periodogram into its continuum and its lines on the grid of the records
     around = scipy.ndimage.median_filter(density, 2 * LINE_AROUND + 1, mode="nearest")
@@ -375,37 +370,25 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
         continuum[near] = np.minimum(continuum[near], around[near])
     # From `FIRST_CLEAN_BIN` upwards the continuum is the measured one. Below, it is a sum of a
     # constant and Lorentzians, not negative, with a structure function closest to the measured.
-    drift = _structure_function(baselines)
+    # That needs no subtraction of the mean, so noise slower than the baseline is retained.
+    padded = scipy.fft.next_fast_len(2 * length, real=True)
+    of_lags = np.zeros(padded // 2 + 1)
+    for rows in blocks(n, 512):
+        of_lags += (np.abs(scipy.fft.rfft(centred[rows], padded)) ** 2).sum(axis=0)
+    products, squares = scipy.fft.irfft(of_lags, padded), np.cumsum((centred**2).sum(axis=0))
+    # sums of squares over samples with a later partner, and over those with an earlier one
+    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
+    pairs = squares[length - 1 - lags] + (squares[-1] - squares[lags - 1])
+    drift = (0.5 * pairs - products[lags]) / (n * (length - lags))
     frequency, measured = np.arange(len(lines)) / samples, bins[FIRST_CLEAN_BIN:] / length
     fast = np.interp(frequency, measured, continuum[FIRST_CLEAN_BIN:])
     constant, fast = np.where(frequency < measured[0], (fast, 0 * fast), (0 * fast, fast))
     corners = np.geomspace(2 / samples, measured[0], CORNERS)[:, np.newaxis]
     slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (measured[0] / corners) ** 2)
     slow = np.vstack([constant, np.maximum(slow, 0)])
-    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
     # both signs of the frequency: a density of 1 is a mean square of 1
     oscillation = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
-    weights = 1 / drift[lags]
-    rest = (drift[lags] - oscillation @ (fast + lines)) * weights
+    weights = 1 / drift
+    rest = (drift - oscillation @ (fast + lines)) * weights
     heights, _ = scipy.optimize.nnls((oscillation @ slow.T) * weights[:, np.newaxis], rest)
     return np.asarray(fast + heights @ slow, float), lines
-
-
-def _structure_function(baselines: Values) -> Values:
-    """Half the mean square difference of samples at lags 0, 1, 2, ...
-
-    Unlike a spectrum it needs no subtraction of the mean. Noise slower than the baseline is
-    therefore retained in full.
-    """
-    n, samples = baselines.shape
-    padded = scipy.fft.next_fast_len(2 * samples, real=True)
-    centred = baselines - baselines.mean(axis=1, keepdims=True)
-    power = np.zeros(padded // 2 + 1)
-    for rows in range(0, n, 512):
-        power += (np.abs(scipy.fft.rfft(centred[rows : rows + 512], padded)) ** 2).sum(axis=0)
-    products = scipy.fft.irfft(power, padded)[:samples]
-    squares = np.cumsum((centred**2).sum(axis=0))
-    lag = np.arange(samples)
-    # sums of squares over samples with a later partner, and over those with an earlier one
-    left, right = squares[samples - 1 - lag], squares[-1] - np.r_[0, squares[:-1]]
-    return np.asarray((0.5 * (left + right) - products) / (n * (samples - lag)), float)

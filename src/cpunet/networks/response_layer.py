@@ -253,7 +253,11 @@ class ElectronicsResponse(Stored):
         spline = np.sinc(everywhere) ** 4 * 3 / (2 + np.cos(2 * math.pi * everywhere))
         fast = (spline * passed).sum(axis=0)
         n_after = math.ceil(padded / MIN_FACTOR) - padding(dt_ns)[0]
-        decays = self.decay(1e-3 * dt_ns * np.arange(n_after, dtype=float))
+        # response of the decays alone to a step of 1
+        time_us = 1e-3 * dt_ns * np.arange(n_after, dtype=float)
+        decays = main = np.exp(-time_us / np.exp(self.log_decay_us))
+        for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True):
+            decays = decays + weight * (np.exp(-time_us / tau) - main)
         whole: npt.NDArray[np.complex128] = fast * scipy.fft.rfft(decays, padded)
         if not self.config.deviations:
             return whole
@@ -295,14 +299,6 @@ class ElectronicsResponse(Stored):
         for weight, tau in zip(self.slow_weights, self.slow_ns, strict=True):
             slow = slow + weight * (1 / (1 + s * tau) - 1)
         return transfer * slow
-
-    def decay(self, time_us: Values) -> Values:
-        """Response of the decays alone to a step of 1 at time 0, at times from 0 on in µs."""
-        main = np.exp(-time_us / np.exp(self.log_decay_us))
-        step = main
-        for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True):
-            step = step + weight * (np.exp(-time_us / tau) - main)
-        return step
 
     def named(self) -> dict[str, tuple[str, float]]:
         """Fitted parameters by name, with the unit at its end: label and value of each.
