@@ -80,12 +80,6 @@ class NoiseSpectrum(Config):
     excess_corner_kHz: Positive
     lines: tuple[NoiseLine, ...] = ()
 
-    @model_validator(mode="after")
-    def _continuum_remains(self) -> NoiseSpectrum:
-        if sum(line.power_fraction for line in self.lines) >= 1:
-            raise ValueError("lines: their power_fraction must add up to less than 1")
-        return self
-
 
 class ReadoutNoise(Config):
     """Noise with an RMS of `rms_kev` and a spectrum, independent of the pulse energy.
@@ -198,6 +192,8 @@ class Electronics(Config):
                 f"baseline_mean_adc must be below {self.adc_top}, the most of adc_bits"
             )
         nyquist_MHz, lines = 500 / self.dt_ns, self.noise.spectrum.lines
+        if sum(line.power_fraction for line in lines) >= 1:
+            raise ValueError("noise.lines: their power_fraction must add up to less than 1")
         if any(line.frequency_MHz >= nyquist_MHz for line in lines):
             raise ValueError(
                 f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate; leave them "
