@@ -10,8 +10,8 @@ In-trace pile-up, pulses within the record of a trace, is drawn by a Poisson pro
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
@@ -53,15 +53,10 @@ class DrawnTails(TailsLaw):
     dt_ns: float
     passed: tuple[float, ...] | None = None
 
-    def uncut(self, rate_khz: float | None = None) -> Self:
-        """Copy without cuts, optionally with another rate in kHz."""
-        rate_khz = self.rate_khz if rate_khz is None else rate_khz
-        return replace(self, rate_khz=rate_khz, passed=None)
-
     def draw_kev(self, n: int, rng: np.random.Generator) -> Values:
         """Draw the tails at the start of `n` traces, in keV."""
         kev = self.draw(n, rng)
-        if self.passed is None or not n:
+        if self.passed is None:
             return kev
         again = np.arange(n)
         for _ in range(100):  # most traces have no tail and pass
@@ -84,12 +79,6 @@ class DrawnTails(TailsLaw):
         """Draw tails for pulses of given energies, in prepared units."""
         kev = self.draw_kev(len(energy_kev), rng)
         return np.asarray(kev * self.height / energy_kev, np.float32)
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Self:
-        """Read the fields from a mapping with lists in place of tuples, as in JSON."""
-        tuples: Any = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-        return cls(**tuples)
 
 
 @dataclass(frozen=True, eq=False)

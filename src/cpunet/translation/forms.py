@@ -289,9 +289,9 @@ def wanted_tails(
             raise CpunetError(f"`tails` {wanted}: expected learned, none, or a rate in kHz")
     tails = _tails_of(translator, f"`tails` {wanted}")
     if rate is not None:
-        tails = tails.uncut(rate)
+        tails = replace(tails, rate_khz=rate, passed=None)
     elif raw:
-        tails = tails.uncut()
+        tails = replace(tails, passed=None)
     return tails if tails.rate_khz > 0 else None
 
 
