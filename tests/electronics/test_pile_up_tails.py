@@ -69,10 +69,8 @@ def traces_of(rate_khz: float, preset: str = "ornl", n: int = 2000) -> RawTraces
     return read_out(Pulses.of(ramps, dt_ns=4, energy_kev=energy), chain, seed=2)
 
 
-def as_pulses(traces: RawTraces, rows: slice = slice(None)) -> Pulses:
-    return Pulses.of(
-        traces.waveforms[rows], dt_ns=traces.dt_ns, energy_kev=traces.energy_kev[rows]
-    )
+def as_pulses(traces: RawTraces) -> Pulses:
+    return Pulses.of(traces.waveforms, dt_ns=traces.dt_ns, energy_kev=traces.energy_kev)
 
 
 @pytest.fixture(scope="module")
@@ -163,7 +161,7 @@ def test_slow_decays_are_told_by_their_levels():
 )
 def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: str):
     with pytest.raises(CpunetError, match=said):
-        PileUpTails.of(Baselines.of([change(as_pulses(busy, slice(0, 400)))], PREPARATION))
+        PileUpTails.of(Baselines.of([change(as_pulses(busy)[:400])], PREPARATION))
 
 
 LAW = TailsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)

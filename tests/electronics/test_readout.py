@@ -119,9 +119,7 @@ def test_windows_go_on_with_their_decay_wherever_their_maximum_is(late: int) -> 
     window = pulse[np.newaxis, PADDING_BEFORE : PADDING_BEFORE + CONFIG.length]
     record = with_room(window.astype(np.float32), CONFIG, DT_NS)
     np.testing.assert_allclose(record[0], pulse, atol=1e-5)
-
-
-def test_what_has_no_decay_stays_at_its_last_level() -> None:
+    # without a decay at the last level
     windows = np.ones((2, CONFIG.length), np.float32)
     windows[0, -20] = -1.0
     windows[1, 3] = np.nan
