@@ -116,14 +116,11 @@ class PositionalUNet(nn.Module):
             PositionalMap(factor * m, length // factor, 0, dropout) for factor in (1, 2, 4, 8)
         )
         self.map_latent = PositionalMap(8 * m, length // 16, 0, dropout)
-        # no map after the last step up
+        # no map after the last step up; the offsets are those of the paper's network
+        levels = (4 * m, 8, 4 * m), (2 * m, 4, 2 * m), (m, 2, 2 * m)
         self.maps_up = nn.ModuleList(
             PositionalMap(channels, length // factor, offset, dropout)
-            for channels, factor, offset in (
-                (4 * m, 8, 4 * m),
-                (2 * m, 4, 2 * m),
-                (m, 2, 2 * m),
-            )
+            for channels, factor, offset in levels
         )
 
     def forward(
