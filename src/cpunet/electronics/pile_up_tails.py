@@ -295,8 +295,9 @@ class PileUpTails:
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
         fit = fit_rate(kev[quiet], guess, decay, baselines.first.energy_kev)
         kev = np.where(quiet, kev - fit.level_kev, np.nan)
-        adc, of_level = (level, gain, widest), (weight, level_error)
-        tails = cls(kev, *of_level, decay, error, *adc, fit, samples, dt_ns)
+        tails = cls(
+            kev, weight, level_error, decay, error, level, gain, widest, fit, samples, dt_ns
+        )
         # with many tails and no precise rate, the level of empty baselines is not seen either
         most = MAX_FULL if tails.law else MAX_UNSURE
         if float(fit.law.share_above(fit.sigma_kev)) > most:
@@ -320,12 +321,9 @@ class PileUpTails:
         baselines = np.asarray(raw.waveforms[:, : self.samples], float)
         mean, left, width = read_baselines(baselines, self.dt_ns, self.decay_us)
         shape = tail_shape(self.samples, self.dt_ns, self.decay_us).mean()
-        kev = (1 - self.level_weight) * left + self.level_weight * (
-            mean - self.level_adc
-        ) / shape
-        return np.where(
-            width <= self.widest_adc, kev / self.adc_per_kev - self.fit.level_kev, np.nan
-        )
+        of_level, weight = (mean - self.level_adc) / shape, self.level_weight
+        kev = ((1 - weight) * left + weight * of_level) / self.adc_per_kev
+        return np.where(width <= self.widest_adc, kev - self.fit.level_kev, np.nan)
 
     def describe(self) -> TailsInfo:
         """Summary: the rate, its error, and fractions of traces above several thresholds."""
