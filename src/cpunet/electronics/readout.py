@@ -269,7 +269,7 @@ def draw_other_pulses(
     return added_kev, tails_kev, piled
 
 
-DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
+FLAGS = {"decaying baseline": 1, "pile-up": 2, "saturated": 4}
 """Bits of a trace's flags. A baseline decays if its tail exceeds the noise RMS."""
 
 
@@ -382,11 +382,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     )
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
-    flag = (
-        np.where(tails_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
-        | np.where(n_piled > 0, PILE_UP, 0)
-        | np.where(beyond.any(axis=1), SATURATED, 0)
-    ).astype(np.uint8)
+    flags = tails_kev > electronics.noise.rms_kev, n_piled > 0, beyond.any(axis=1)
     # the resolution grows with the root of the energy
     fwhm_kev = np.sqrt(electronics.resolution_fwhm_kev**2 / REFERENCE_KEV * energy)
     smeared = np.random.default_rng(int(resolution.integers(2**63)))
@@ -397,7 +393,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         event_number=pulses.event_number,
         peak=pulses.peak,
         t0_ns=np.zeros(n),
-        flag=flag,
+        flag=np.asarray([*FLAGS.values()] @ np.array(flags), np.uint8),
         response=by_height(response, electronics, energy[:, None]).astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,

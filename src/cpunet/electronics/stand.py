@@ -13,14 +13,7 @@ import numpy.typing as npt
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
-from cpunet.electronics.readout import (
-    DECAYING_BASELINE,
-    PILE_UP,
-    SATURATED,
-    by_height,
-    linear_response,
-    read_out,
-)
+from cpunet.electronics.readout import FLAGS, by_height, linear_response, read_out
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import Pulses
@@ -46,7 +39,6 @@ STAND = FolderKind(
     command="cpunet stand",
     own=r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz",
 )
-FLAGS = {"decaying baseline": DECAYING_BASELINE, "pile-up": PILE_UP, "saturated": SATURATED}
 # Truth about each measured trace besides its line, in ``data_labels.npz``.
 OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
 MADE = {MADE_BY: f"cpunet stand {cpunet.__version__}"}
@@ -342,7 +334,7 @@ def _write_data(
             for name in OF_DATA:
                 columns[name].append(getattr(traces, name))
     whole: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
-    saturated = whole["flag"] & SATURATED > 0
+    saturated = whole["flag"] & FLAGS["saturated"] > 0
     if 2 * saturated.sum() > len(saturated):
         raise CpunetError(
             f"electronics {electronics.name}: {saturated.sum()} of {len(saturated)} traces "
