@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines, tail_shape
-from cpunet.electronics.tails_law import TailsLaw
+from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
+from cpunet.electronics.tails_law import TailsLaw, tail_shape
 from cpunet.plotting import COLOURS, DATA_FILL, styled
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import FloatArray, Pulses
@@ -61,7 +61,7 @@ class Slopes:
             / tails.adc_per_kev
             for traces in (raw, flat)
         )
-        return cls(before, after, np.abs(kev[determined]) < EMPTY * tails.error_kev)
+        return cls(before, after, np.abs(kev[determined]) < EMPTY * tails.fit.sigma_kev)
 
     @property
     def spreads(self) -> tuple[float, float]:
@@ -87,7 +87,7 @@ def tails_figure(raw: Pulses, tails: PileUpTails) -> Figure:
     figure = Figure(figsize=(11, 3.6))
     sizes, slopes, traces = figure.subplots(1, 3)
     kev = tails.measure(raw)
-    _sizes(sizes, kev[np.isfinite(kev)], tails.fit.law, tails.error_kev)
+    _sizes(sizes, kev[np.isfinite(kev)], tails.fit.law, tails.fit.sigma_kev)
     _slopes(slopes, Slopes.of(raw, tails))
     _traces(traces, raw, tails, kev)
     return figure
@@ -124,7 +124,7 @@ def _slopes(axes: Axes, slopes: Slopes) -> None:
 
 
 def _traces(axes: Axes, raw: Pulses, tails: PileUpTails, kev: Values) -> None:
-    large = np.flatnonzero(np.nan_to_num(kev) > 20 * tails.error_kev)
+    large = np.flatnonzero(np.nan_to_num(kev) > 20 * tails.fit.sigma_kev)
     chosen = large[np.argsort(kev[large])][:: max(1, len(large) // SHOWN)][:SHOWN]
     flat = _subtracted(raw[chosen], tails)
     time_us = np.arange(tails.samples) * tails.dt_ns * 1e-3
@@ -151,7 +151,7 @@ def _subtracted(raw: Pulses, tails: PileUpTails) -> Pulses:
 
 
 def _in_kev(traces: FloatArray, tails: PileUpTails) -> Values:
-    return np.asarray((traces - tails.baseline_adc) / tails.adc_per_kev, float)
+    return np.asarray((traces - tails.level_adc) / tails.adc_per_kev, float)
 
 
 def main() -> None:

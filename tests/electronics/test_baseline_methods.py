@@ -10,21 +10,18 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cpunet.electronics.baseline_methods import BaselineMethod, fit_rc, rc
-from cpunet.electronics.finishing import finish
-from cpunet.electronics.superpulses import (
+from cpunet.electronics.baseline_methods import (
     BASELINE_METHODS,
     LEAD_NS,
+    BaselineMethod,
     crossing,
-    fit_gauss_exp,
-    fit_rc_late,
-    fit_superpulse,
     gauss_exp,
 )
+from cpunet.electronics.finishing import finish
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
-from synthetic import PADDING_AFTER, PADDING_BEFORE, load_recipe, paired_scores
+from synthetic import load_recipe, paired_scores
 
 CONFIG = load_recipe("paper").preparation
 DT_NS, ALIGN = 16.0, CONFIG.samples_before
@@ -51,13 +48,6 @@ def ideal(n: int, seed: int) -> FloatArray:
         slow = np.clip(time / end, 0, 1) ** 2
         pulses += (share * (0.25 * slow + 0.75 * rise)).astype(np.float32)
     return (pulses / pulses[:, -1:]).astype(np.float32)
-
-
-def padded(windows: FloatArray) -> FloatArray:
-    """Records without electronics: baseline before the windows, the last value after them."""
-    before = np.zeros((len(windows), PADDING_BEFORE))
-    after = np.repeat(windows[:, -1:], PADDING_AFTER, axis=1)
-    return np.concatenate([before, windows, after], axis=1, dtype=np.float32)
 
 
 def sampled(fine: FloatArray) -> FloatArray:
@@ -108,23 +98,21 @@ def other_fine() -> FloatArray:
 )
 def test_gauss_exp_recovers_its_widths(sim, other_fine, sigma_ns, tau_ns) -> None:
     response = sampled(convolved(other_fine, gauss_exp_kernel(sigma_ns, tau_ns)))
-    method = fit_gauss_exp(sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN)
+    method = BASELINE_METHODS["gauss_exp"](
+        sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN
+    )
     assert method.values["sigma_ns"] == pytest.approx(sigma_ns, rel=0.03)
     assert method.values["tau_ns"] == pytest.approx(tau_ns, rel=0.03)
     assert method.tail_slope_per_ms == pytest.approx(-1e6 / DECAY_NS, rel=0.01)
 
 
-@pytest.mark.parametrize("tau_ns", [50.0, 100.0])
+@pytest.mark.parametrize("tau_ns", [DT_NS, 50.0, 100.0])
 def test_rc_recovers_its_time_constant(sim, other_fine, tau_ns) -> None:
+    """From a period on, behind which pulses are fast enough."""
     rate = DT_NS / tau_ns
     response = scipy.signal.lfilter([0, rate], [1, rate - 1], sampled(other_fine), axis=1)
-    method = fit_rc(sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN)
+    method = BASELINE_METHODS["rc"](sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN)
     assert method.values["tau_ns"] == pytest.approx(tau_ns, rel=0.05)
-
-
-def test_rc_leaves_pulses_that_are_fast_enough(sim, other_fine) -> None:
-    method = fit_rc(sim, measured(decayed(sampled(other_fine), DT_NS)), DT_NS, ALIGN)
-    assert method.values["tau_ns"] < 1.5 * DT_NS
 
 
 def two_pole_kernel() -> np.ndarray:
@@ -136,7 +124,7 @@ def two_pole_kernel() -> np.ndarray:
 def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
     kernel = two_pole_kernel()
     data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
-    method = fit_superpulse(sim, data, DT_NS, ALIGN)
+    method = BASELINE_METHODS["superpulse"](sim, data, DT_NS, ALIGN)
     kernel_of_method = method.transfer.args[0]
     steps = np.cumsum(kernel_of_method)[np.newaxis]
     time = np.arange(0, 200) * DT_NS
@@ -167,21 +155,12 @@ def test_windows_are_those_of_the_true_response(sigma_ns: float, tau_ns: float) 
     assert scores.unaligned == 0
 
 
-OF_80_NS = BaselineMethod(DT_NS, -18.0, partial(rc, DT_NS, 80.0), {})
-
-
-def test_finished_windows_are_prepared_ones(sim) -> None:
-    windows = finish(OF_80_NS.translate(sim), CONFIG, dt_ns=DT_NS).windows
-    again = prepare(Pulses.of(windows, dt_ns=DT_NS), CONFIG, "measured").pulses.waveforms
-    np.testing.assert_allclose(again, windows, atol=1e-6)
-
-
 def test_bad_input_is_named(sim) -> None:
     for method in BASELINE_METHODS.values():
         with pytest.raises(CpunetError, match=r"7 simulated pulses; give \d+ or more"):
             method(sim[:7], sim, DT_NS, ALIGN)
     with pytest.raises(CpunetError, match="check their polarity"):
-        fit_rc(sim, -sim, DT_NS, ALIGN)
+        BASELINE_METHODS["rc"](sim, -sim, DT_NS, ALIGN)
 
 
 def test_rc_with_late_charge_recovers_its_parts(sim, other_fine) -> None:
@@ -191,7 +170,7 @@ def test_rc_with_late_charge_recovers_its_parts(sim, other_fine) -> None:
         0.93 * (time == 0) / FINE_NS + 0.07 * np.exp(-time / 500) / 500,
     )[: len(time)]
     data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
-    found = fit_rc_late(sim, data, DT_NS, ALIGN)
+    found = BASELINE_METHODS["rc_late"](sim, data, DT_NS, ALIGN)
     assert found.values["tau_ns"] == pytest.approx(60, rel=0.1)
     assert found.values["late_share"] == pytest.approx(0.07, abs=0.015)
     assert found.values["late_ns"] == pytest.approx(500, rel=0.35)

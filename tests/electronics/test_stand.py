@@ -24,8 +24,6 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import Shift, SimulationSettings
 from cpunet.simulation.simulate import StoredSimulation
 from cpunet.simulation.simulator import Simulator
-from cpunet.training.chain_fit import POOR
-from cpunet.training.train import train
 from synthetic import load_recipe, prepared_truth
 
 # a small crystal
@@ -44,7 +42,6 @@ EVENTS = {"FEP": 10, "1000-2000": 30}
 SMALL = {"electronics": "ornl", "detector": DETECTOR, "events": EVENTS}
 FILES = (".cpunet.json", "data.lh5", "data_labels.npz", "sim.lh5", "stand.json", "truth.npz")
 
-
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
@@ -60,12 +57,10 @@ def made(
     content: dict[str, npt.NDArray[Any]] = {}
     for name in ("sim.lh5", "data.lh5"):
         with h5py.File(out / name) as file:
-
-            def keep(path: str, item: Any, name: str = name) -> None:
-                if isinstance(item, h5py.Dataset):
-                    content[f"{name}/{path}"] = item[()]
-
-            file.visititems(keep)
+            paths: list[str] = []
+            file.visit(paths.append)
+            sets = {f"{name}/{path}": file[path] for path in paths}
+            content |= {k: v[()] for k, v in sets.items() if isinstance(v, h5py.Dataset)}
     for name in ("truth.npz", "data_labels.npz"):
         with np.load(out / name) as arrays:
             content |= {f"{name}/{key}": arrays[key] for key in arrays.files}
@@ -115,22 +110,6 @@ def test_the_folder_is_read_and_prepared(tmp_path: Path) -> None:
     assert (left == (flags["flag"] & 1 > 0)).mean() > 0.99
     assert 0.1 < left.mean() < 0.6
     assert set(flags) == {"label", "flag", "tails_kev", "n_piled", "piled_kev", "piled_ns"}
-
-
-@pytest.mark.slow
-def test_a_fit_finds_the_fast_decay_of_a_stand(tmp_path: Path) -> None:
-    """With 2,000 pulses a fit with fixed fast decays is poor."""
-    still = {"earlier_pulses.rate_kHz": 0}
-    stand = tmp_path / "stand"
-    make_stand(stand, electronics="ornl", settings=still, events="FEP=2000", seed=3)
-    sides = PulseFile(stand / "sim.lh5"), PulseFile(stand / "data.lh5")
-    train(*sides, tmp_path / "run")
-    fit = json.loads((tmp_path / "run" / "run.json").read_text())["fit"]
-    found = fit["parameters"]
-    assert found["pole_1_ns"] == pytest.approx(55, rel=0.1)
-    assert found["fast_decay_1_us"] == pytest.approx(2.9, rel=0.15)
-    assert found["decay_us"] == pytest.approx(54.6, rel=0.05)
-    assert fit["chi_square"] < POOR * fit["moments"]
 
 
 def test_a_stand_of_any_period_is_the_same_stand(tmp_path: Path) -> None:
@@ -198,12 +177,9 @@ def test_any_shift_is_that_of_the_data(tmp_path: Path) -> None:
 def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
     for settings, said in (
         ({"dt_ns": 0.05}, "dt_ns: Input should be greater than or equal to 1"),
-        ({"dt_ns": 3000}, "dt_ns: Input should be less than or equal to 200"),
         ({"dt_ns": 12.5}, "dt_ns must be a multiple of step_ns, 1 ns; add step_ns=0.5$"),
         ({"dt_ns": 3.001}, "multiple of step_ns, 1 ns; choose another$"),
         ({"step_ns": 8}, "step_ns = 8: a stand needs steps of at most 4 ns; lower it$"),
-        ({"record_ns": 20}, "before_ns must be at least dt_ns and less than record_ns"),
-        ({"earlier_pulses.rate_kHz": 1e300}, "earlier_pulses.rate_kHz: Input should be less"),
         ({"bias": 3}, "bias: no such setting"),
     ):
         with pytest.raises(CpunetError, match=said):
@@ -218,7 +194,7 @@ def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
     [
         (lambda file: file["geds/sim"].attrs.pop("simulation"), "give an output of cpunet"),
         (lambda file: file.pop("geds/hits"), "give an output of cpunet simulate or"),
-        (lambda file: _set(file, "geds/sim/event_number", slice(0, 2), 1), "other events"),
+        (lambda file: file["geds/sim/event_number"].write_direct(np.ones(3, int)), "other ev"),
         (lambda file: file["geds/sim"].attrs.update(simulation="{}"), "cannot be used by this"),
         (lambda file: file["geds/sim"].attrs.update(simulation="{"), "cannot be used by this"),
     ],
@@ -231,7 +207,3 @@ def test_a_file_that_cannot_be_made_again_says_why(
         damage(file)
     with pytest.raises(CpunetError, match=re.escape(said)):
         StoredSimulation.read(tmp_path / "a" / "sim.lh5")
-
-
-def _set(file: h5py.File, name: str, rows: Any, value: int) -> None:
-    file[name][rows] = value

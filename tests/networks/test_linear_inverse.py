@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import numpy.typing as npt
-import pytest
 
 from cpunet.networks import generators
 from cpunet.networks.generators import LinearInverse, stretch
@@ -20,35 +19,16 @@ def edges(*starts: int) -> npt.NDArray[np.float32]:
     return np.stack([((time - start) / 4).clip(0, 1) for start in starts])
 
 
-@pytest.fixture
-def identity(monkeypatch: pytest.MonkeyPatch) -> LinearInverse:
-    """Gives back what it gets in the region about the half maximum."""
+def test_it_gives_back_what_it_gets_about_the_half_maximum_and_0_and_1_beyond(monkeypatch):
     monkeypatch.setattr(generators, "AFTER_NS", 128.0)
     config = load_recipe("fast").matching.training.model_copy(update=STRETCHES)
-    network = LinearInverse(60, config)
-    network.half_height[...] = 0.5
-    network.weights[...] = np.eye(20)
-    return network
-
-
-def test_beyond_the_region_it_is_0_and_1(identity):
-    pulses = edges(30)
-    pulses[:, :10] += 0.2
-    pulses[:, 55:] -= 0.3
-    np.testing.assert_allclose(identity(pulses), edges(30), atol=1e-5, rtol=1e-5)
-
-
-def test_the_mean_is_put_in_place_of_what_has_no_weight(identity):
-    identity.weights[...] = 0
-    identity.mean_out[...] = np.linspace(0, 1, 20)
-    result = identity(edges(30))
-    # the half maximum lies after sample 31, where the region has its twelfth sample
-    np.testing.assert_allclose(result[0, 19:39], np.linspace(0, 1, 20), atol=1e-6)
-
-
-def test_a_window_that_is_no_pulse_has_nothing_to_say_to_others(identity):
+    identity = LinearInverse(60, config)
+    identity.half_height[...] = 0.5
+    identity.weights[...] = np.eye(20)
     pulses = 0.9 * edges(25, 30, 33) + np.float32(0.05)  # of any offset and height
-    pulses[1] = float("nan")
+    pulses[0, :5] += 0.2
+    pulses[0, 55:] -= 0.3
+    pulses[1] = float("nan")  # has nothing to say to others
     result = identity(pulses)
     assert result.dtype == np.float32
     assert np.isnan(result[1]).any()

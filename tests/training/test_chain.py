@@ -155,6 +155,6 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     assert any(note.startswith("pile-up tails: ") for note in caplog.messages)
     ren = REN.load(tmp_path / "run")
     assert ren.tails is not None
-    assert ren.tails.law.rate_khz == told["rate_khz"]
+    assert ren.tails.rate_khz == told["rate_khz"]
     # without tails the noise is that of empty baselines
     assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * PREPARED, rel=0.07)

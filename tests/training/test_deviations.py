@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from cpunet.networks.response_layer import (
+    LATE_NS,
     ElectronicsResponse,
     deviation_lags,
-    late_lags,
     padding,
 )
 from cpunet.training.chain_parameters import with_settings
@@ -160,7 +160,7 @@ def test_a_deviation_acts_at_its_lags_and_decays_with_the_chain():
     apart = moved - plain
     np.testing.assert_allclose(apart[: last + 1], deviation[-lags[0] :], atol=1e-12)
     np.testing.assert_allclose(apart[lags[0] :], deviation[: -lags[0]], atol=1e-12)
-    early, late = late_lags(DT_NS)
+    early, late = (round(ns / DT_NS) for ns in LATE_NS)
     rate = np.log(moved[late] / moved[early]) / (late - early)
     np.testing.assert_allclose(
         moved[last:4000], moved[last] * np.exp(rate * np.arange(4000 - last)), atol=1e-9

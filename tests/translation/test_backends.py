@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,6 @@ import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
-from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import KeptNoise
 from cpunet.networks.positional_unet import PositionalUNet
@@ -184,8 +184,8 @@ def noisy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     kept.set_noise(noise)
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("run")
-    drawn = DrawnTails(TailsLaw(2.0, 50.0, (100.0, 2000.0)), 1.0, 0.0, DT_NS)
-    fit = {"tails": {"rate_khz": 2.0, "drawn": drawn.describe()}}
+    drawn = DrawnTails(2.0, 50.0, (100.0, 2000.0), 1.0, 0.0, DT_NS)
+    fit = {"tails": {"rate_khz": 2.0, "drawn": asdict(drawn)}}
     parts = untrained(NOISY) | {"noise": kept}
     write_run(folder, parts, NOISY, FACTS | {"fit": fit})
     return folder

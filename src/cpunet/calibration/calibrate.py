@@ -32,7 +32,7 @@ from cpunet.calibration.nuisances import (
     titled,
 )
 from cpunet.calibration.search import Search
-from cpunet.electronics.measured import drawn_like, noise_of, tails_of
+from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
@@ -263,17 +263,15 @@ def _search(
     recipe = data.recipe.at(data.dt_ns)
     physics = Physics(stored.detector, stored.settings, freedom.looked_at)
     require_depletion(physics, freedom.priors)
-    tails, _ = tails_of(data)
-    drawn = None
-    if tails is not None and tails.law is not None:
-        drawn = drawn_like(tails, data, recipe.preparation)
-    noise = noise_of(data, tails)
+    noise, _ = trace_noise(data, recipe.preparation)
     # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
     some, rng = sim.prepared[rows], np.random.default_rng(seed)
     search = Search(
         simulator=Simulator(stored.hits[some.index], physics),
-        sets=PulseSets(some.pulses, data.prepared.pulses, noise, recipe, rng, drawn),
+        sets=PulseSets(
+            some.pulses, data.prepared.pulses, noise.noise, recipe, rng, noise.tails
+        ),
         recipe=recipe,
         given={k: v for k, v in freedom.priors.items() if k != DEPLETION},
         knowledge=known_depletion(physics, freedom.priors.get(DEPLETION)),

@@ -4,12 +4,23 @@ Each is a linear response applied to windows: a kernel on the current, then the 
 is padded before the response is applied. No charge moves before the window, and all is
 collected by its end, so the current is zero on both sides. The padding holds the parts of the
 response outside the window and allows the window to be cut again after a later alignment.
+
+Superpulses are mean currents of pulses with similar rise times, aligned at half maximum.
+Simulated and measured pulses are of different events, so single pulses cannot be compared.
+Their means can, once both datasets are divided at the same quantiles of rise time. Pulses of
+one slice then originate from the same regions of the detector.
+
+`gauss_exp` is the kernel of LEGEND's production: sigma and tau are fitted to the
+superpulses. `fit_superpulse` divides their spectra. In each slice the mean measured current is
+the mean simulated one convolved with the kernel. The transfer function of the kernel is
+therefore the ratio of their spectra, H = sum(D S*) / sum(|S|^2) over the slices. A Wiener
+factor suppresses H where the measured spectrum does not exceed its statistical error.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
@@ -21,7 +32,7 @@ import scipy.signal
 from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, blocks
-from cpunet.pulses.parameters import current_amplitude, tail_slope
+from cpunet.pulses.parameters import current_amplitude, last_below, tail_slope
 
 Values = npt.NDArray[np.float64]
 Spectrum = npt.NDArray[np.complex128]
@@ -29,7 +40,6 @@ Spectrum = npt.NDArray[np.complex128]
 MIN_PULSES = 50  # of either dataset, for a fit
 TAIL_SHARE = 0.75  # of the time after the alignment: 4.8 of 6.4 us, as in the paper
 LONGEST_NS = 1024.0  # maximum sigma and tau
-MAX_PULSES = 4000  # maximum number of pulses in the fit of an RC
 TOLERANCE = 1e-3  # precision of its tau, in samples
 
 
@@ -102,97 +112,93 @@ def currents(windows: FloatArray, dt_ns: float) -> Values:
     return record
 
 
-def fitted_tail_slope(data: FloatArray, dt_ns: float, align: int) -> float:
-    """Median logarithmic slope of the tails, in 1/ms.
-
-    Raises
-    ------
-    CpunetError
-        If no tail is positive.
-    """
-    slopes = tail_slope(data, dt_ns, _tail_samples(data, align))
-    slopes = slopes[np.isfinite(slopes)]
-    if not slopes.size:
-        raise CpunetError("no measured pulse has a positive tail; check their polarity")
-    return float(np.median(slopes))
+Kernel = tuple[Callable[[int], Spectrum], dict[str, float]]
+"""Transfer function at the frequencies of a record, and fitted values by name."""
 
 
-def _tail_samples(windows: FloatArray, align: int) -> int:
-    """Number of samples at the end of windows that contain only the decay."""
-    return max(3, int(TAIL_SHARE * (windows.shape[1] - align)))
-
-
-def fitted_decay(
-    sim: FloatArray, data: FloatArray, dt_ns: float, align: int, most: int
-) -> tuple[float, FloatArray]:
-    r"""Tail slope of the data, and the data without their decay (pole-zero correction).
+def fitted(
+    fit: Callable[[FloatArray, FloatArray, float], Kernel],
+    most: int,
+    sim: FloatArray,
+    data: FloatArray,
+    dt_ns: float,
+    align: int,
+    *,
+    late: bool = False,
+) -> BaselineMethod:
+    r"""Fit the decay, and a kernel to the data without it (pole-zero correction).
 
     .. math:: x_j = \sum_{k \le j} \left(s_k - e^{\lambda \Delta t} s_{k-1}\right)
 
-    with the logarithmic slope :math:`\lambda` of the tail.
+    with the median logarithmic slope :math:`\lambda` of the tails.
 
     Parameters
     ----------
+    fit
+        Fit of the kernel to simulated windows and data without decay, both of unit height, and
+        their sampling period in ns.
+    most
+        Number of pulses at most of either side that are compared.
     sim, data
         Prepared windows, shape ``(n, length)``. Simulated ones range from 0 to 1.
     dt_ns
         Sampling period in ns.
     align
         Sample at which both are aligned.
-    most
-        Number of pulses at most that are corrected.
-
-    Returns
-    -------
-    tuple
-        The slope in 1/ms; pulses of unit height, float32.
+    late
+        Whether the kernel has a late part, which contributes to the tail.
 
     Raises
     ------
     CpunetError
-        If a side has too few pulses, or no tail is positive.
-
-    Examples
-    --------
-    An exponential decay becomes a step.
-
-    >>> decay = np.r_[np.zeros(10), np.exp(-np.arange(30) * 0.016 / 50)]  # 50 us
-    >>> decays = np.repeat(decay[np.newaxis], 50, axis=0)
-    >>> slope, steps = fitted_decay(decays, decays, 16.0, 10, 1)
-    >>> round(slope, 3), steps[0, [9, 10, 39]].round(6).tolist()
-    (-20.0, [0.0, 1.0, 1.0])
+        If a side has too few pulses, or no tail is positive, or the fit of the kernel fails.
     """
     for side, windows in (("simulated", sim), ("measured", data)):
         if len(windows) < MIN_PULSES:
             raise CpunetError(
                 f"{len(windows)} {side} pulses; give {MIN_PULSES} or more to fit a response to"
             )
-    slope = fitted_tail_slope(data, dt_ns, align)
+    length = data.shape[1]
+    late_samples = max(3, int(TAIL_SHARE * (length - align)))  # contain only the decay
+
+    def slope_of(windows: FloatArray) -> float:
+        slopes = tail_slope(windows, dt_ns, late_samples)
+        slopes = slopes[np.isfinite(slopes)]
+        if not slopes.size:
+            raise CpunetError("no measured pulse has a positive tail; check their polarity")
+        return float(np.median(slopes))
+
+    slope = slope_of(data)
     current = data[:most].astype(float)
     current[:, 1:] -= np.exp(slope * dt_ns * 1e-6) * data[:most, :-1]
     steps = np.cumsum(current, axis=1)
-    heights = steps[:, -_tail_samples(data, align) :].mean(axis=1, keepdims=True)
-    return slope, (steps / heights).astype(np.float32)
+    heights = steps[:, -late_samples:].mean(axis=1, keepdims=True)
+    transfer, values = fit(sim[:most], (steps / heights).astype(np.float32), dt_ns)
+    method = BaselineMethod(dt_ns, slope, transfer, values)
+    if not late:
+        return method
+    before = padding(dt_ns)[0]
+    added = slope_of(method.translate(sim[:most])[:, before : before + length]) - slope
+    return replace(method, tail_slope_per_ms=slope - added)
 
 
-def fit_rc(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> BaselineMethod:
+def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
     r"""A single RC integration: match the mode of the current amplitudes.
 
     .. math:: s_j = s_{j-1} + (x_{j-1} - s_{j-1})\, \Delta t / \tau
 
     as in siggen, with :math:`\tau` of at least one sampling period. For the parameters see
-    `fitted_decay`.
+    `fitted`.
 
     Raises
     ------
     CpunetError
-        For the reasons of `fitted_decay`, or if the data are slower than the maximum tau.
+        If the data are slower than the maximum tau.
     """
-    slope, steps = fitted_decay(sim, data, dt_ns, align, MAX_PULSES)
     wanted = most_frequent(current_amplitude(steps, dt_ns))
     before, longest = padding(dt_ns)[0], LONGEST_NS / dt_ns
     window = slice(before, before + sim.shape[1])
-    current = currents(sim[:MAX_PULSES], dt_ns)
+    current = currents(sim, dt_ns)
 
     def excess(tau: float) -> float:
         slower = scipy.signal.lfilter([0.0, 1 / tau], [1.0, 1 / tau - 1.0], current)
@@ -208,7 +214,7 @@ def fit_rc(sim: FloatArray, data: FloatArray, dt_ns: float, align: int) -> Basel
         )
     else:
         tau_ns = dt_ns * float(scipy.optimize.brentq(excess, 1.0, longest, xtol=TOLERANCE))
-    return BaselineMethod(dt_ns, slope, partial(rc, dt_ns, tau_ns), {"tau_ns": tau_ns})
+    return partial(rc, dt_ns, tau_ns), {"tau_ns": tau_ns}
 
 
 def rc(dt_ns: float, tau_ns: float, length: int) -> Spectrum:
@@ -233,3 +239,252 @@ def most_frequent(values: Values) -> float:
         raise CpunetError("no pulse has a current amplitude; check the prepared pulses")
     first = int(np.argmin(ordered[half:] - ordered[: len(ordered) - half]))
     return float(np.median(ordered[first : first + half]))
+
+
+SLICES = 8
+SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is used
+RISE_START, RISE_END = 0.02, 0.95  # above the noise at the start, below the slow top
+
+
+def crossing(steps: Values, fraction: float) -> Values:
+    """Sample at which each pulse of unit height last rises through a fraction.
+
+    The sample is interpolated linearly. It is NaN if there is no crossing before `RISE_END`.
+
+    Examples
+    --------
+    >>> crossing(np.array([[0.0, 0.0, 0.4, 0.8, 1.0, 1.0]]), 0.5)
+    array([2.25])
+    """
+    top = (steps >= RISE_END).argmax(axis=1)
+    last = last_below(steps, top, np.full(len(steps), fraction))
+    crossed, last = last >= 0, np.minimum(last, steps.shape[1] - 2)
+    rows = np.arange(len(steps))
+    low, high = steps[rows, last], steps[rows, last + 1]
+    rise = np.where(crossed, high - low, 1.0)
+    return np.asarray(np.where(crossed, last + (fraction - low) / rise, np.nan), float)
+
+
+def slices(current: Values) -> list[npt.NDArray[np.int64]]:
+    """Rows of single-site-like pulses between quantiles of rise time.
+
+    The pulses with the highest current in each slice are used. They differ far less from
+    each other than multi-site pulses, and so do their means between datasets.
+
+    Parameters
+    ----------
+    current
+        Currents of pulses of unit height, shape ``(n, length)``.
+
+    Raises
+    ------
+    CpunetError
+        If too few pulses rise from baseline to top.
+    """
+    steps = np.cumsum(current, axis=1)
+    rise = crossing(steps, RISE_END) - crossing(steps, RISE_START)
+    rows = np.flatnonzero(np.isfinite(rise))
+    if len(rows) < 2 * SLICES / SINGLE_SITE:
+        raise CpunetError(
+            f"only {len(rows)} of {len(current)} pulses rise from baseline to top; "
+            "check that they are prepared charge pulses"
+        )
+    # Over three samples, the peak hardly depends on the sampling phase.
+    height = (current[:, :-2] + current[:, 1:-1] + current[:, 2:]).max(axis=1)
+    ordered = rows[np.argsort(rise[rows], kind="stable")]
+    return [
+        group[np.argsort(height[group])[-int(np.ceil(SINGLE_SITE * len(group))) :]]
+        for group in np.array_split(ordered, SLICES)
+    ]
+
+
+def aligned(spectra: Spectrum, response: Values) -> Spectrum:
+    r"""Current spectra of pulses, with the half maximum of each at sample 0.
+
+    .. math:: X_{pk}\, e^{2 \pi i k t_p / N}
+
+    with the half maximum :math:`t_p` of pulse :math:`p` in samples.
+
+    Parameters
+    ----------
+    spectra
+        Spectra of the currents, shape ``(n, length // 2 + 1)``.
+    response
+        The currents that align the pulses, shape ``(n, length)``.
+    """
+    (n, length), bins = response.shape, spectra.shape[1]
+    times = crossing(np.cumsum(response, axis=1), 0.5)[:, np.newaxis] * (2j * np.pi / length)
+    # the phase of bin a + root b is the product of two: far fewer exponentials
+    root = int(np.ceil(np.sqrt(bins)))
+    fine, coarse = (np.exp(times * step * np.arange(root)) for step in (1, root))
+    phases = coarse[:, :, np.newaxis] * fine[:, np.newaxis]
+    return np.asarray(spectra * phases.reshape(n, -1)[:, :bins])
+
+
+FITTED_ROUNDS = 3  # of the fit of parameters, each with slices from the response fitted so far
+EDGE_NS = 1536.0  # time compared before and after the half maximum
+
+
+def gauss_exp(dt_ns: float, sigma_ns: float, tau_ns: float, length: int) -> Spectrum:
+    r"""A Gaussian and an exponential, at the frequencies of a record.
+
+    .. math:: H(\omega) = \frac{e^{-\sigma^2 \omega^2 / 2}}{1 + i \omega \tau}
+    """
+    omega = 2e-3 * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
+    gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
+    return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
+
+
+def rc_late(
+    dt_ns: float, tau_ns: float, late_share: float, late_ns: float, length: int
+) -> Spectrum:
+    r"""An RC integration with a part of the charge that comes late.
+
+    .. math:: H(\omega) = \frac{1}{1 + i \omega \tau}
+        \left(1 - w + \frac{w}{1 + i \omega T}\right)
+
+    with the share :math:`w` of the late charge and its time constant :math:`T`.
+    """
+    s = 2e-3j * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
+    late = late_share / (1 + s * late_ns)
+    return np.asarray((1 - late_share + late) / (1 + s * tau_ns), complex)
+
+
+def fit_kernel(
+    transfer: Callable[..., Spectrum],
+    parameters: Mapping[str, tuple[float, float, float]],
+    sim: FloatArray,
+    steps: FloatArray,
+    dt_ns: float,
+    *,
+    late: bool = False,
+) -> Kernel:
+    """A kernel with parameters, fitted to superpulses.
+
+    Parameters
+    ----------
+    transfer
+        Transfer function: a function of the period in ns, the parameters and the length.
+    parameters
+        Where each starts, its largest value (the smallest is 0), and its scale, by name.
+    sim, steps, dt_ns
+        See `fitted`.
+    late
+        Whether a part of the charge comes late. It counts for little in currents, so charges
+        are compared.
+    """
+    (best, high, scale), names = np.transpose([*parameters.values()]), [*parameters]
+    measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
+    length = record_length(sim.shape[1], dt_ns)
+
+    def superpulses(parts: Sequence[Spectrum], kernel: Spectrum | float = 1.0) -> Values:
+        """Mean currents of slices around the half maximum, shape ``(slices, 2 * edge)``."""
+        behind = [part * kernel for part in parts]
+        moved = [aligned(part, scipy.fft.irfft(part, length, axis=1)) for part in behind]
+        means = np.array([part.mean(axis=0) for part in moved])
+        around = np.roll(scipy.fft.irfft(means, length, axis=1), edge, axis=1)
+        return np.asarray(around[:, : 2 * edge], float)
+
+    def residual(at: Values, parts: Sequence[Spectrum]) -> Values:
+        off = superpulses(parts, transfer(dt_ns, *at, length)) - wanted
+        return np.asarray(np.cumsum(off, axis=1) if late else off).ravel()
+
+    of_data, of_sim = (
+        np.asarray(scipy.fft.rfft(current, axis=1), complex)
+        for current in (measured, currents(sim, dt_ns))
+    )
+    wanted = superpulses([of_data[rows] for rows in slices(measured)])
+    for _ in range(FITTED_ROUNDS):
+        response = of_sim * transfer(dt_ns, *best, length)
+        sliced = [of_sim[rows] for rows in slices(scipy.fft.irfft(response, length, axis=1))]
+        best = scipy.optimize.least_squares(
+            residual,
+            best,
+            bounds=(0.0, high),
+            x_scale=scale,
+            diff_step=1e-3,
+            xtol=1e-4,
+            args=(sliced,),
+        ).x
+    values = dict(zip(names, best.tolist(), strict=True))
+    return partial(transfer, dt_ns, *values.values()), values
+
+
+FREE_ROUNDS = 4  # of the free kernel, each with half maxima of the response so far
+# The kernel before and after the half maximum, and where its ends are tapered.
+LEAD_NS, LAG_NS = 512.0, 4096.0
+FADE_IN_NS, FADE_OUT_NS = 128.0, 1024.0
+
+
+def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
+    r"""A free kernel: `LEAD_NS` before zero delay and `LAG_NS` from it on, with a sum of 1.
+
+    .. math:: H = W \frac{\sum D S^*}{\sum (|S|^2 + \sigma_S^2)}, \qquad
+        W = \max\left(0, 1 - \frac{\sum \sigma_D^2}{\sum |D|^2}\right)
+
+    The sums run over the slices. :math:`D` and :math:`S` are the mean spectra of data and
+    simulation, :math:`\sigma_D` and :math:`\sigma_S` their statistical errors. For the
+    parameters see `fitted`.
+    """
+    length, current = record_length(sim.shape[1], dt_ns), currents(steps, dt_ns)
+
+    def superpulses(spectra: Spectrum, response: Values) -> tuple[Spectrum, Values]:
+        """Mean spectrum of each slice, and its squared standard error.
+
+        The error includes noise and the differences between pulses within a slice.
+        """
+        moved = [aligned(spectra[rows], response[rows]) for rows in slices(response)]
+        error = np.array([part.var(axis=0) / max(1, len(part) - 1) for part in moved])
+        return np.array([part.mean(axis=0) for part in moved]), error
+
+    measured, data_error = superpulses(np.asarray(scipy.fft.rfft(current, axis=1)), current)
+    wiener = np.clip(1 - data_error.sum(axis=0) / (np.abs(measured) ** 2).sum(axis=0), 0, 1)
+    lead, lag, fade_in, fade_out = (
+        round(time / dt_ns) for time in (LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS)
+    )
+    fades = np.ones(lead + lag)
+    begin, end = (
+        np.sin(0.5 * np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in (fade_in, fade_out)
+    )
+    fades[:fade_in], fades[-fade_out:] = begin, end[::-1]
+    spectra = np.asarray(scipy.fft.rfft(currents(sim, dt_ns), axis=1))
+    kernel = np.zeros(lead + lag)
+    kernel[lead] = 1.0
+    for _ in range(FREE_ROUNDS):
+        # The simulated pulses are placed by the half maximum of their response. A shift
+        # of their own half maximum does not give this exactly.
+        response = scipy.fft.irfft(spectra * free(kernel, lead, length), length, axis=1)
+        simulated, sim_error = superpulses(spectra, response)
+        below = (np.abs(simulated) ** 2 + sim_error).sum(axis=0)
+        ratio = wiener * (measured * simulated.conj()).sum(axis=0) / below
+        kernel = np.roll(scipy.fft.irfft(ratio, length), lead)[: lead + lag] * fades
+        kernel /= kernel.sum()
+    time_ns = np.arange(len(kernel)) * dt_ns
+    mean_ns = float(kernel @ time_ns)
+    variance = float(kernel @ (time_ns - mean_ns) ** 2)
+    values = {
+        "kernel_mean_ns": mean_ns - LEAD_NS,
+        "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
+    }
+    return partial(free, kernel, lead), values
+
+
+def free(kernel: Values, lead: int, length: int) -> Spectrum:
+    """Transfer function of a kernel that begins `lead` samples before zero delay."""
+    around_zero = np.zeros(length)
+    around_zero[: len(kernel)] = kernel
+    return np.asarray(scipy.fft.rfft(np.roll(around_zero, -lead)), complex)
+
+
+# Where parameters start, their largest values, and their scales.
+_WIDTH = 32.0, LONGEST_NS, LONGEST_NS
+_GAUSS_EXP = {"sigma_ns": _WIDTH, "tau_ns": _WIDTH}
+_RC_LATE = {"tau_ns": _WIDTH, "late_share": (0.05, 0.5, 1.0)}
+_RC_LATE["late_ns"] = 400.0, 4 * LONGEST_NS, LONGEST_NS
+_rc_late = partial(fit_kernel, rc_late, _RC_LATE, late=True)
+BASELINE_METHODS: dict[str, Callable[[FloatArray, FloatArray, float, int], BaselineMethod]] = {
+    "rc": partial(fitted, fit_rc, 4000),
+    "rc_late": partial(fitted, _rc_late, 2000, late=True),
+    "gauss_exp": partial(fitted, partial(fit_kernel, gauss_exp, _GAUSS_EXP), 2000),
+    "superpulse": partial(fitted, fit_superpulse, 4000, late=True),
+}

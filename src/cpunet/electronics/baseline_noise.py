@@ -22,7 +22,7 @@ from cpunet.electronics.exponentials import FloatArray as Values
 from cpunet.electronics.pile_up_tails import MIN_BASELINES
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
-from cpunet.pulses.container import FloatArray, line_slope
+from cpunet.pulses.container import FloatArray, blocks, line_slope
 
 MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory
@@ -133,35 +133,41 @@ class BaselineNoise:
                 f"{MIN_NS:.0f} or more, so give traces with a longer baseline"
             )
         used = baselines.prepared[rows[before >= length]]
-        samples = baselines.first.waveforms[used.index, :length].astype(float)
+        values = baselines.first.waveforms[used.index, :length].astype(float)
         kev, dt_ns = used.pulses.energy_kev / used.scale, baselines.first.dt_ns
-        values = (samples - used.baseline[:, np.newaxis]) * kev[:, np.newaxis]
-        if len(values) and not np.median(np.ptp(values, axis=1)):
+        values = (values - used.baseline[:, np.newaxis]) * kev[:, np.newaxis]
+        if not np.median(np.ptp(values, axis=1)):
             raise CpunetError(
                 "most baselines are constant: there is no noise to learn; give measured traces"
             )
-        flat = values[_flat(values)] if len(values) else values
+        # those that neither slope nor contain another pulse, nor are constant
+        slope = values @ line_slope(length)
+        line = slope[:, np.newaxis] * (np.arange(length) - 0.5 * (length - 1))
+        width, fine = (values - line).std(axis=1), np.ptp(values, axis=1) > 0
+        for _ in range(CLIPS):
+            for off in (np.abs(slope - np.median(slope[fine])), width - np.median(width[fine])):
+                sigma = 1.4826 * np.median(np.abs(off[fine]))
+                fine &= off <= FLAT_SIGMAS * sigma  # quiet baselines are as flat as others
+        flat = values[fine]
         if len(flat) < MIN_BASELINES:
             raise CpunetError(
                 f"only {len(flat)} flat baselines among {chosen.sum()} traces; give more "
                 f"traces (at least {MIN_BASELINES} with known energy)"
             )
-        continuum, lines = spectrum(flat, record_samples(dt_ns))
-        mean = cls(continuum + lines, 2 * (len(lines) - 1), dt_ns, len(flat))
+        samples = record_samples(dt_ns)
+        mean = cls(np.add(*spectrum(flat, samples)), samples, dt_ns, len(flat))
         which = _kinds(flat, mean)
         counts = np.bincount(which)
-        spectra = [
-            spectrum(flat[which == kind], record_samples(dt_ns)) for kind in range(len(counts))
-        ]
-        kinds, kinds_lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
+        spectra = [spectrum(flat[which == kind], samples) for kind in range(len(counts))]
+        kinds, lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
         # standard error of an RMS that is partly extrapolated beyond the baselines
         power = flat.var(axis=1)
         seen = float(np.sqrt(power.mean()))
-        chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5) if seen else 0.0
+        chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5)
         return replace(
             mean,
             kinds=kinds,
-            lines=kinds_lines,
+            lines=lines,
             shares=counts / counts.sum(),
             rms_error=float(np.hypot(chance, mean.rms - seen)),
         )
@@ -206,10 +212,14 @@ class BaselineNoise:
         # Twice as long as needed, so that its end is independent of its beginning.
         long = max(scipy.fft.next_fast_len(2 * length, real=True), self.samples)
         each = max(1, (long - length) // length)  # parts of a trace, with a gap at its end
-        continua = self.density[np.newaxis] if self.kinds is None else self.kinds
-        shares = np.ones(1) if self.shares is None else self.shares
-        size = _sizes(self._at(continua, long), long)
-        lines = None if self.lines is None else _sizes(self._lines_at(long), long)
+        continua, lines, shares = self.at(long)
+        # variances of the real and imaginary parts of FFT bins
+        variances = 0.5 * long * np.stack([continua, lines])
+        # these bins are real: all their power is in the real part
+        variances[..., 0] *= 2
+        if long % 2 == 0:
+            variances[..., -1] *= 2
+        size, lines = np.sqrt(variances).astype(np.float32)
         noise = np.empty((n, length), np.float32)
         order = rng.permutation(n)
         # each kind as often as among the baselines, in random order
@@ -221,12 +231,12 @@ class BaselineNoise:
             shape = (len(kind), 2 * size.shape[1])
             bins = rng.standard_normal(shape, np.float32).view(np.complex64)
             bins *= size[kind]
-            if lines is not None:
-                # sines of random phase: of fixed amplitude, the RMS modulus of a Gaussian bin
-                trace, column = np.nonzero(lines[kind])
-                phase = rng.uniform(0, 2 * np.pi, len(trace))
-                heights = np.sqrt(2) * lines[kind][trace, column]
-                bins[trace, column] += heights * np.exp(1j * phase)
+            # lines are sines of random phase: of fixed amplitude, the RMS modulus of a
+            # Gaussian bin
+            trace, column = np.nonzero(lines[kind])
+            phase = rng.uniform(0, 2 * np.pi, len(trace))
+            heights = np.sqrt(2) * lines[kind][trace, column]
+            bins[trace, column] += heights * np.exp(1j * phase)
             traces = scipy.fft.irfft(bins, long, axis=1, overwrite_x=True)
             noise[rows] = traces[:, : each * length].reshape(-1, length)[: len(rows)]
         noise *= (rng.choice((-1.0, 1.0), n) / energy_kev)[:, np.newaxis]
@@ -234,35 +244,23 @@ class BaselineNoise:
 
     def density_of(self, length: int) -> Values:
         """Density at the frequencies of a real FFT of `length` samples, shape ``(bins,)``."""
-        return np.asarray(self._at(self.density[np.newaxis], length)[0], float)
+        return np.asarray(replace(self, kinds=None).at(length)[0][0], float)
 
-    def _at(self, densities: Values, length: int) -> Values:
-        frequency = np.arange(densities.shape[1]) / self.samples
-        wanted = np.arange(length // 2 + 1) / length
-        if len(wanted) == len(frequency):
-            return densities
-        return np.asarray(
-            [np.interp(wanted, frequency, density) for density in densities], float
-        )
+    def at(self, length: int) -> tuple[Values, Values, Values]:
+        """Continua and lines of all kinds, shape ``(kinds, bins)``, and share of each kind.
 
-    def _lines_at(self, length: int) -> Values:
-        """Lines at the frequencies of an FFT of `length` samples: each stays in one bin."""
-        assert self.lines is not None
-        moved = np.zeros((len(self.lines), length // 2 + 1))
+        The bins are those of a real FFT of `length` samples. A line stays in a single bin.
+        """
+        own = self.density[np.newaxis] if self.kinds is None else self.kinds
+        at, frequency = np.arange(length // 2 + 1) / length, np.arange(own.shape[1])
+        continua = np.array([np.interp(at, frequency / self.samples, kind) for kind in own])
+        lines, longer = np.zeros_like(continua), length / self.samples
+        if self.lines is None or self.shares is None or self.kinds is None:
+            return continua, lines, np.ones(1)
         kind, place = np.nonzero(self.lines)
-        nearest = np.rint(place * (length / self.samples)).astype(int)
-        np.add.at(moved, (kind, nearest), self.lines[kind, place] * (length / self.samples))
-        return moved
-
-
-def _sizes(densities: Values, long: int) -> FloatArray:
-    """Standard deviation of the real and imaginary parts of FFT bins of `long` samples."""
-    variances = 0.5 * long * densities
-    # these bins are real: all their power is in the real part
-    variances[:, 0] *= 2
-    if long % 2 == 0:
-        variances[:, -1] *= 2
-    return np.asarray(np.sqrt(variances), np.float32)
+        nearest = np.rint(place * longer).astype(int)
+        np.add.at(lines, (kind, nearest), self.lines[kind, place] * longer)
+        return continua, lines, self.shares
 
 
 def require_energies(energy_kev: npt.NDArray[np.float64]) -> None:
@@ -302,10 +300,9 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     # kmeans2 warns of an empty kind, which is harmless: it is left out below
     with warnings.catch_warnings(action="ignore"):
         centres, which = scipy.cluster.vq.kmeans2(points, kinds, minit="++", rng=rng, iter=50)
-    # baselines of kinds with too few are assigned to the nearest kind with enough
+    # baselines of kinds with too few are assigned to the nearest kind with enough: the largest
+    # at least has as many
     enough = np.bincount(which, minlength=kinds) >= MIN_BASELINES
-    if not enough.any():
-        return alike
     return np.asarray(scipy.cluster.vq.vq(points, centres[enough])[0], np.intp)
 
 
@@ -316,19 +313,6 @@ def _band_powers(baselines: Values) -> Values:
     power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
     bands = np.array_split(power[:, FIRST_OF_BANDS:], BANDS, axis=1)
     return np.asarray(np.log(np.stack([b.mean(axis=1) for b in bands], axis=1)), float)
-
-
-def _flat(baselines: Values) -> npt.NDArray[np.bool_]:
-    """Select baselines that neither slope nor contain another pulse, nor are constant."""
-    n = baselines.shape[1]
-    slope = baselines @ line_slope(n)
-    width = (baselines - slope[:, np.newaxis] * (np.arange(n) - 0.5 * (n - 1))).std(axis=1)
-    flat = np.asarray(np.ptp(baselines, axis=1) > 0)
-    for _ in range(CLIPS):
-        for off in (np.abs(slope - np.median(slope[flat])), width - np.median(width[flat])):
-            sigma = 1.4826 * np.median(np.abs(off[flat]))
-            flat &= off <= FLAT_SIGMAS * sigma  # quiet baselines are as flat as others
-    return flat
 
 
 def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
@@ -364,10 +348,10 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
     >>> bool(abs(continuum[1000:].mean() - 4) < 0.1), bool(lines.any())
     (True, False)
     """
-    length = baselines.shape[1]
+    n, length = baselines.shape
     window = np.hanning(length + 1)[:-1]
-    centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
-    power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
+    centred = baselines - baselines.mean(axis=1, keepdims=True)
+    power = np.abs(scipy.fft.rfft(centred * window, axis=1)) ** 2
     density = np.asarray(power.mean(axis=0) / (window @ window), float)
     # split a periodogram into its continuum and its lines on the grid of the records
     around = scipy.ndimage.median_filter(density, 2 * LINE_AROUND + 1, mode="nearest")
@@ -386,37 +370,25 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
         continuum[near] = np.minimum(continuum[near], around[near])
     # From `FIRST_CLEAN_BIN` upwards the continuum is the measured one. Below, it is a sum of a
     # constant and Lorentzians, not negative, with a structure function closest to the measured.
-    drift = _structure_function(baselines)
+    # That needs no subtraction of the mean, so noise slower than the baseline is retained.
+    padded = scipy.fft.next_fast_len(2 * length, real=True)
+    of_lags = np.zeros(padded // 2 + 1)
+    for rows in blocks(n, 512):
+        of_lags += (np.abs(scipy.fft.rfft(centred[rows], padded)) ** 2).sum(axis=0)
+    products, squares = scipy.fft.irfft(of_lags, padded), np.cumsum((centred**2).sum(axis=0))
+    # sums of squares over samples with a later partner, and over those with an earlier one
+    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
+    pairs = squares[length - 1 - lags] + (squares[-1] - squares[lags - 1])
+    drift = (0.5 * pairs - products[lags]) / (n * (length - lags))
     frequency, measured = np.arange(len(lines)) / samples, bins[FIRST_CLEAN_BIN:] / length
     fast = np.interp(frequency, measured, continuum[FIRST_CLEAN_BIN:])
     constant, fast = np.where(frequency < measured[0], (fast, 0 * fast), (0 * fast, fast))
     corners = np.geomspace(2 / samples, measured[0], CORNERS)[:, np.newaxis]
     slow = 1 / (1 + (frequency / corners) ** 2) - 1 / (1 + (measured[0] / corners) ** 2)
     slow = np.vstack([constant, np.maximum(slow, 0)])
-    lags = np.unique(np.geomspace(4, 0.9 * length, LAGS).astype(int))
     # both signs of the frequency: a density of 1 is a mean square of 1
     oscillation = 2 * (1 - np.cos(2 * np.pi * lags[:, np.newaxis] * frequency)) / samples
-    weights = 1 / drift[lags]
-    rest = (drift[lags] - oscillation @ (fast + lines)) * weights
+    weights = 1 / drift
+    rest = (drift - oscillation @ (fast + lines)) * weights
     heights, _ = scipy.optimize.nnls((oscillation @ slow.T) * weights[:, np.newaxis], rest)
     return np.asarray(fast + heights @ slow, float), lines
-
-
-def _structure_function(baselines: Values) -> Values:
-    """Half the mean square difference of samples at lags 0, 1, 2, ...
-
-    Unlike a spectrum it needs no subtraction of the mean. Noise slower than the baseline is
-    therefore retained in full.
-    """
-    n, samples = baselines.shape
-    padded = scipy.fft.next_fast_len(2 * samples, real=True)
-    centred = baselines - baselines.mean(axis=1, keepdims=True)
-    power = np.zeros(padded // 2 + 1)
-    for rows in range(0, n, 512):
-        power += (np.abs(scipy.fft.rfft(centred[rows : rows + 512], padded)) ** 2).sum(axis=0)
-    products = scipy.fft.irfft(power, padded)[:samples]
-    squares = np.cumsum((centred**2).sum(axis=0))
-    lag = np.arange(samples)
-    # sums of squares over samples with a later partner, and over those with an earlier one
-    left, right = squares[samples - 1 - lag], squares[-1] - np.r_[0, squares[:-1]]
-    return np.asarray((0.5 * (left + right) - products) / (n * (samples - lag)), float)

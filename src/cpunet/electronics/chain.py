@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 from pydantic import Field, model_validator
 
 from cpunet.electronics.exponentials import Exponentials, moved_apart
@@ -78,12 +79,6 @@ class NoiseSpectrum(Config):
     excess: NonNegative
     excess_corner_kHz: Positive
     lines: tuple[NoiseLine, ...] = ()
-
-    @model_validator(mode="after")
-    def _continuum_remains(self) -> NoiseSpectrum:
-        if sum(line.power_fraction for line in self.lines) >= 1:
-            raise ValueError("lines: their power_fraction must add up to less than 1")
-        return self
 
 
 class ReadoutNoise(Config):
@@ -197,6 +192,8 @@ class Electronics(Config):
                 f"baseline_mean_adc must be below {self.adc_top}, the most of adc_bits"
             )
         nyquist_MHz, lines = 500 / self.dt_ns, self.noise.spectrum.lines
+        if sum(line.power_fraction for line in lines) >= 1:
+            raise ValueError("noise.lines: their power_fraction must add up to less than 1")
         if any(line.frequency_MHz >= nyquist_MHz for line in lines):
             raise ValueError(
                 f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate; leave them "
@@ -238,27 +235,22 @@ class Electronics(Config):
         >>> bool(abs(read_electronics("ornl").transfer.at(0)) < 1e-12)  # no constant current
         True
         """
-        single = [part for part in (self.slow, self.overshoot) if part]
-        taus = moved_apart(
-            [
-                *self.bandwidth_poles_ns,
-                *(part.tau_ns for part in single),
-                *(1e3 * part.tau_us for part in self.decays),
-            ]
-        )
-        n_poles, n_decays = len(self.bandwidth_poles_ns), len(self.decays)
-        chain = Exponentials.decaying(
-            [part.fraction for part in self.decays], taus[len(taus) - n_decays :]
-        )
-        for part, tau in zip(single, taus[n_poles:], strict=False):
-            # a slow part is missing at first, an overshoot is in excess
-            sign = -1 if part is self.overshoot else 1
-            chain = chain * Exponentials.mixed(sign * part.fraction, tau)
-        for tau in taus[:n_poles]:
+        poles, decays = self.bandwidth_poles_ns, self.decays
+        # a slow part is missing at first, an overshoot is in excess
+        mixed = [(s.tau_ns, s.fraction) for s in (self.slow,) if s]
+        mixed += [(over.tau_ns, -over.fraction) for over in (self.overshoot,) if over]
+        decays_ns = (1e3 * part.tau_us for part in decays)
+        taus = moved_apart([*poles, *(tau for tau, _ in mixed), *decays_ns])
+        shares = [part.fraction for part in decays]
+        chain = Exponentials.decaying(shares, taus[-len(decays) :])
+        for (_, fraction), tau in zip(mixed, taus[len(poles) :], strict=False):
+            chain = chain * Exponentials.mixed(fraction, tau)
+        for tau in taus[: len(poles)]:
             chain = chain * Exponentials.low_pass(tau)
         if ring := self.ringing:
-            wave = Exponentials.ringing(ring.fraction, ring.frequency_MHz, ring.damping_ns)
-            chain = chain * wave
+            pole = complex(-1 / ring.damping_ns, 2 * np.pi * ring.frequency_MHz * 1e-3)
+            both = np.array([pole, pole.conjugate()])
+            chain = chain * Exponentials(1.0, both, ring.fraction * both / np.array([2j, -2j]))
         return chain
 
 

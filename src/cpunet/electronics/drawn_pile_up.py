@@ -10,21 +10,20 @@ In-trace pile-up, pulses within the record of a trace, is drawn by a Poisson pro
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.exponentials import FloatArray as Values
-from cpunet.electronics.pile_up_tails import PileUpTails, tail_shape
-from cpunet.electronics.tails_law import TailsLaw, earlier_pulses
+from cpunet.electronics.pile_up_tails import PileUpTails
+from cpunet.electronics.tails_law import TailsLaw, earlier_pulses, tail_shape
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import CutWindows, apply_cuts, prepare
 from cpunet.recipes.schema import PreparationConfig
-from cpunet.settings import plain
 
 # Tails in keV at which the probability of passing the cuts is measured.
 SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
@@ -32,13 +31,13 @@ TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which tails are added
 
 
 @dataclass(frozen=True, eq=False)
-class DrawnTails:
+class DrawnTails(TailsLaw):
     """Tails to be drawn and added to records.
 
     Parameters
     ----------
-    law
-        Law from which they are drawn, at the start of a trace as long as the data's.
+    rate_khz, decay_us, energies_kev
+        The law from which they are drawn, at the start of a trace as long as the data's.
     height
         Height of a 1 keV pulse in prepared units times keV: about the maximum of a window.
     lead_us
@@ -49,21 +48,15 @@ class DrawnTails:
         Probability of passing the cuts of the data at `SIZES_KEV`. None if there are no cuts.
     """
 
-    law: TailsLaw
     height: float
     lead_us: float
     dt_ns: float
     passed: tuple[float, ...] | None = None
 
-    def uncut(self, rate_khz: float | None = None) -> Self:
-        """Copy without cuts, optionally with another rate in kHz."""
-        law = self.law if rate_khz is None else replace(self.law, rate_khz=rate_khz)
-        return replace(self, law=law, passed=None)
-
     def draw_kev(self, n: int, rng: np.random.Generator) -> Values:
         """Draw the tails at the start of `n` traces, in keV."""
-        kev = self.law.draw(n, rng)
-        if self.passed is None or not n:
+        kev = self.draw(n, rng)
+        if self.passed is None:
             return kev
         again = np.arange(n)
         for _ in range(100):  # most traces have no tail and pass
@@ -72,34 +65,20 @@ class DrawnTails:
             again = again[rng.random(len(again)) >= passes]
             if not len(again):
                 break
-            kev[again] = self.law.draw(len(again), rng)
+            kev[again] = self.draw(len(again), rng)
         return kev
 
     def decay(self, length: int, lead_us: float | None = None) -> Values:
         """Tail of 1 keV at each sample of a record, shape ``(length,)``."""
-        lead = self.lead_us if lead_us is None else lead_us
-        time_us = np.arange(length) * self.dt_ns * 1e-3 + lead
-        return np.asarray(np.exp(-time_us / self.law.decay_us), float)
+        lead_us = self.lead_us if lead_us is None else lead_us
+        return tail_shape(length, self.dt_ns, self.decay_us, lead_us)
 
     def factors(
         self, energy_kev: npt.NDArray[np.float64], rng: np.random.Generator
     ) -> FloatArray:
         """Draw tails for pulses of given energies, in prepared units."""
-        require_energies(energy_kev)
         kev = self.draw_kev(len(energy_kev), rng)
         return np.asarray(kev * self.height / energy_kev, np.float32)
-
-    def describe(self) -> dict[str, float | list[float] | None]:
-        """Serialise to a mapping that `of` reads."""
-        values: dict[str, Any] = plain(asdict(self))
-        return {**values.pop("law"), **values}
-
-    @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Self:
-        """Read a mapping written by `describe`."""
-        law = TailsLaw(values["rate_khz"], values["decay_us"], tuple(values["energies_kev"]))
-        passed = None if values["passed"] is None else tuple(values["passed"])
-        return cls(law, values["height"], values["lead_us"], values["dt_ns"], passed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,7 +131,7 @@ def passing(
     tuple of float
         One probability per size, or None if too few traces have no tail.
     """
-    raw = traces.waveforms[tails.measure(traces) < tails.error_kev][:TEMPLATES]
+    raw = traces.waveforms[tails.measure(traces) < tails.fit.sigma_kev][:TEMPLATES]
     if len(raw) < MIN_TEMPLATES:
         return None
     shape = tail_shape(raw.shape[1], tails.dt_ns, tails.decay_us)

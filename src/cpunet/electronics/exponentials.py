@@ -23,10 +23,9 @@ class Exponentials:
 
     .. math:: H(s) = d + \sum_k \frac{\rho_k}{s - p_k}
 
-    Its impulse and step responses are sums of exponentials,
+    Its step response is a sum of exponentials,
 
-    .. math:: h(t) = d\,\delta(t) + \sum_k \rho_k e^{p_k t}, \qquad
-        r(t) = d + \sum_k \frac{\rho_k}{p_k} \left(e^{p_k t} - 1\right).
+    .. math:: r(t) = d + \sum_k \frac{\rho_k}{p_k} \left(e^{p_k t} - 1\right).
 
     Parameters
     ----------
@@ -70,14 +69,6 @@ class Exponentials:
         return cls.of_real(1 - fraction, [tau_ns], [fraction / tau_ns])
 
     @classmethod
-    def ringing(cls, fraction: float, frequency_MHz: float, damping_ns: float) -> Exponentials:
-        r"""Damped oscillation: step response :math:`1 + f e^{-t/\tau_d} \sin(2\pi\nu t)`."""
-        pole = complex(-1 / damping_ns, 2 * np.pi * frequency_MHz * 1e-3)
-        residue = fraction * pole / 2j
-        poles, residues = [pole, pole.conjugate()], [residue, residue.conjugate()]
-        return cls(1.0, np.array(poles), np.array(residues))
-
-    @classmethod
     def decaying(cls, fractions: Sequence[float], taus_ns: Sequence[float]) -> Exponentials:
         r"""RC coupling: step response :math:`\sum_i f_i e^{-t/\tau_i}`."""
         residues = [-f / tau for f, tau in zip(fractions, taus_ns, strict=True)]
@@ -92,20 +83,9 @@ class Exponentials:
         """Cascade two circuits. They must not share a pole."""
         return Exponentials(
             self.direct * other.direct,
-            np.concatenate([self.poles, other.poles]),
-            np.concatenate(
-                [
-                    self.residues * other.at(self.poles),
-                    other.residues * self.at(other.poles),
-                ]
-            ),
+            np.r_[self.poles, other.poles],
+            np.r_[self.residues * other.at(self.poles), other.residues * self.at(other.poles)],
         )
-
-    def impulse(self, t_ns: npt.ArrayLike) -> FloatArray:
-        """Impulse response in 1/ns at times in ns, without the instantaneous part."""
-        t = np.asarray(t_ns, float)
-        modes = np.exp(np.maximum(t, 0)[..., None] * self.poles) * self.residues
-        return np.where(t >= 0, modes.sum(axis=-1).real, 0.0)
 
     def step(self, t_ns: npt.ArrayLike) -> FloatArray:
         """Response to a unit step at 0, at times in ns; zero before it."""
@@ -125,21 +105,15 @@ def moved_apart(taus_ns: Sequence[float]) -> list[float]:
     [39.98, 500.0, 40.02]
     """
     values = np.array(taus_ns, float)
-    groups: list[list[int]] = []
+    groups: list[tuple[list[int], FloatArray]] = []  # of values, and where they move
     for i in np.argsort(values, kind="stable").tolist():
-        group = [i]
+        group, moved = [i], values[[i]]
         # the more values are in a group, the farther it reaches
-        while groups and (
-            _spread(values[group])[0] < (1 + _APART) * _spread(values[groups[-1]])[-1]
-        ):
-            group = groups.pop() + group
-        groups.append(group)
-    for group in groups:
-        values[group] = _spread(values[group])
+        while groups and moved[0] < (1 + _APART) * groups[-1][1][-1]:
+            group = groups.pop()[0] + group
+            steps = np.arange(len(group)) - (len(group) - 1) / 2
+            moved = values[group].mean() * (1 + _APART * steps)
+        groups.append((group, moved))
+    for group, moved in groups:
+        values[group] = moved
     return [float(tau) for tau in values]
-
-
-def _spread(values: FloatArray) -> FloatArray:
-    """As many values as given, a relative `_APART` from one another, about the mean."""
-    steps = np.arange(len(values)) - (len(values) - 1) / 2
-    return np.asarray(values.mean() * (1 + _APART * steps), float)

@@ -17,7 +17,7 @@ from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.parameters import tail_slope
-from cpunet.pulses.preparation import Codes, prepare
+from cpunet.pulses.preparation import Codes, Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
 # Padding before and after a window in ns, so that it can be cut anew and delayed pulses stay
@@ -165,31 +165,32 @@ def finish(
     windows = np.full((n, config.length), np.nan, np.float32)
     noisy = windows if noise is None else windows.copy()
     codes, begin = np.zeros(n, np.uint8), np.zeros(n, np.int64)
+
+    def prepared(raw: FloatArray, places: npt.NDArray[np.intp], into: FloatArray) -> Prepared:
+        """Prepare records, whose windows belong to some places."""
+        done = prepare(Pulses.of(raw, dt_ns=dt_ns), config, "measured")
+        codes[places] = done.codes
+        into[places[done.index]] = done.pulses.waveforms
+        begin[places[done.index]] = done.align_sample - config.samples_before
+        return done
+
     for rows in blocks(n):
         block = records[rows]
         if by_height is not None:
             assert energy_kev is not None  # what a height is
             block = by_height(block, energy_kev[rows], 0.0)
-        clean = prepare(Pulses.of(block, dt_ns=dt_ns), config, "measured")
-        codes[rows] = clean.codes
-        places = np.arange(n)[rows][clean.index]
-        windows[places] = clean.pulses.waveforms
-        begin[places] = clean.align_sample - config.samples_before
+        clean = prepared(block, np.arange(n)[rows], windows)
         if noise is not None:
             assert energy_kev is not None  # noise scales as 1/energy
+            places = np.arange(n)[rows][clean.index]
             height = clean.scale[:, np.newaxis]
             level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
             drawn = noise.draw(energy_kev[places], block.shape[1], rng)
             if added is not None:
                 drawn += added[places]
             if by_height is None:
-                noisy_records = level + drawn
+                raw = level + drawn
             else:
-                charge = records[rows][clean.index]
-                noisy_records = by_height(charge, energy_kev[places], drawn * height)
-            raw = Pulses.of(np.asarray(noisy_records, np.float32), dt_ns=dt_ns)
-            prepared = prepare(raw, config, "measured")
-            codes[places] = prepared.codes
-            noisy[places[prepared.index]] = prepared.pulses.waveforms
-            begin[places[prepared.index]] = prepared.align_sample - config.samples_before
+                raw = by_height(records[places], energy_kev[places], drawn * height)
+            prepared(np.asarray(raw, np.float32), places, noisy)
     return Finished(noisy, codes, windows, begin)

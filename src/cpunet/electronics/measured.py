@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from dataclasses import asdict
 
 import numpy as np
 
@@ -14,6 +15,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.loading import InputSet
 from cpunet.recipes.schema import PreparationConfig
+from cpunet.settings import plain
 
 log = logging.getLogger(__name__)
 
@@ -46,17 +48,28 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
     if pile_up is None:
         log.info(f"pile-up tails are not measured: {reason}")
         return TraceNoise(noise_of(data)), TailsInfo(missing=reason)
-    drawn = drawn_like(pile_up, data, config)
-    info = pile_up.describe().model_copy(update={"drawn": drawn.describe()})
-    if pile_up.law is not None:
-        tenth = info.percent_above["10_kev"]["measured"]
-        alone = "" if pile_up.coupled else " (by slopes alone: levels do not follow the tilts)"
-        log.info(
-            f"pile-up tails: {pile_up.law.rate_khz:.2f} ± {pile_up.fit.rate_error_khz:.2f} "
-            f"kHz{alone}, {tenth:.2g} % of the traces above 10 keV; translations are "
-            "given them"
-        )
-    return TraceNoise(noise_of(data, pile_up), drawn if pile_up.law else None), info
+    # tails to draw like those of the data behind their quality cuts
+    law, baselines, dt_ns, passed = pile_up.law, _baselines(data), data.dt_ns, None
+    if data.cuts is not None and baselines.whole is not None and law is not None:
+        passed = passing(pile_up, baselines.whole, config, data.cuts)
+    before = config.at(dt_ns).samples_before + padding(dt_ns)[0]
+    begins = float(np.median(data.prepared.align_sample)) - before
+    height = float(np.median(data.prepared.pulses.waveforms.max(axis=1)))
+    own = asdict(pile_up.fit.law)
+    drawn = DrawnTails(
+        **own, height=height, lead_us=begins * dt_ns * 1e-3, dt_ns=dt_ns, passed=passed
+    )
+    info = pile_up.describe().model_copy(update={"drawn": plain(asdict(drawn))})
+    if law is None:
+        return TraceNoise(noise_of(data, pile_up)), info
+    slopes = " (by slopes alone: levels do not follow the tilts)"
+    log.info(
+        f"pile-up tails: {info.rate_khz:.2f} ± {info.rate_error_khz:.2f} kHz"
+        f"{'' if pile_up.level_weight else slopes}, "
+        f"{info.percent_above['10_kev']['measured']:.2g} % of the traces above 10 keV; "
+        "translations are given them"
+    )
+    return TraceNoise(noise_of(data, pile_up), drawn), info
 
 
 def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
@@ -65,33 +78,6 @@ def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
         return PileUpTails.of(_baselines(data)), None
     except CpunetError as error:
         return None, str(error)
-
-
-def drawn_like(tails: PileUpTails, data: InputSet, config: PreparationConfig) -> DrawnTails:
-    """Distribution of tails like that of the data after their quality cuts.
-
-    Parameters
-    ----------
-    tails
-        Pile-up tails measured in the data.
-    data
-        Measured pulses that passed the cuts.
-    config
-        Preparation of the pulses.
-    """
-    windows, whole = data.prepared.pulses.waveforms, _baselines(data).whole
-    before = config.at(data.dt_ns).samples_before + padding(data.dt_ns)[0]
-    begins = float(np.median(data.prepared.align_sample)) - before
-    passed = None
-    if data.cuts is not None and whole is not None and tails.law is not None:
-        passed = passing(tails, whole, config, data.cuts)
-    return DrawnTails(
-        law=tails.fit.law,
-        height=float(np.median(windows.max(axis=1))),
-        lead_us=begins * data.dt_ns * 1e-3,
-        dt_ns=data.dt_ns,
-        passed=passed,
-    )
 
 
 def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
@@ -105,8 +91,7 @@ def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
     CpunetError
         If the baselines are too few or too short.
     """
-    baselines = _baselines(data)
-    first = baselines.first
+    first = (baselines := _baselines(data)).first
     usable = np.isfinite(first.energy_kev) & (first.energy_kev > 0)
     usable[NOISE_TRACES:] = False
     if tails is not None and tails.law is not None:

@@ -19,7 +19,7 @@ from pydantic import Field
 from scipy.stats import median_abs_deviation
 
 from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate
+from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate, tail_shape
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
@@ -35,6 +35,16 @@ COUPLED = 2.5
 # another pulse.
 DISTURBED = 6.0
 MIN_SAMPLES = 64  # minimum length of a baseline
+LARGE = 12.0  # minimum height in errors of tails used for the decay time
+# If a larger fraction of traces has tails above the error, noise is measured only from
+# traces with tails below 0, at the cost of half of the noise.
+MANY = 0.1
+LEVEL_TELLS = 0.2  # weight of the level above which it identifies empty baselines
+# The rate is significant above SURE errors, with a log-likelihood gain above SURE_GAIN.
+SURE, SURE_GAIN = 4.0, 12.0
+# Maximum fraction of traces with a tail larger than the error, at a significant rate or not.
+MAX_FULL, MAX_UNSURE = 0.97, 0.5
+SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # thresholds at which fractions are reported
 
 
 def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
@@ -76,11 +86,6 @@ def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
         )
     values = baselines.first.waveforms[:, :length].astype(float)
     return values, float(np.median(gains)), -1e3 / slope
-
-
-def tail_shape(length: int, dt_ns: float, decay_us: float) -> FloatArray:
-    """Decay of a tail that is 1 at the first sample, shape ``(length,)``."""
-    return np.asarray(np.exp(-np.arange(length) * dt_ns * 1e-3 / decay_us), float)
 
 
 def read_baselines(
@@ -142,32 +147,6 @@ def lower_spread(values: FloatArray) -> float:
     return max(float(SIGMA_PER_MAD * np.median(below)) if len(below) else 0.0, 1e-9)
 
 
-def own_decay_us(above: FloatArray, dt_ns: float) -> tuple[float, float] | None:
-    """Decay time from the two halves of tilted baselines, and its error, in us."""
-    half = above.shape[1] // 2
-    first, second = above[:, :half].mean(axis=1), above[:, half : 2 * half].mean(axis=1)
-    whole = (first > 0) & (second > 0)
-    fall = np.log(first[whole] / second[whole])
-    middle = float(np.median(fall)) if whole.sum() >= MIN_LARGE else 0.0
-    if not middle > 0:
-        return None
-    error = 1.2533 * float(median_abs_deviation(fall, scale="normal"))
-    decay = half * dt_ns * 1e-3 / middle
-    return decay, decay * error / middle / float(np.sqrt(len(fall)))
-
-
-LARGE = 12.0  # minimum height in errors of tails used for the decay time
-# If a larger fraction of traces has tails above the error, noise is measured only from
-# traces with tails below 0, at the cost of half of the noise.
-MANY = 0.1
-LEVEL_TELLS = 0.2  # weight of the level above which it identifies empty baselines
-# The rate is significant above SURE errors, with a log-likelihood gain above SURE_GAIN.
-SURE, SURE_GAIN = 4.0, 12.0
-# Maximum fraction of traces with a tail larger than the error, at a significant rate or not.
-MAX_FULL, MAX_UNSURE = 0.97, 0.5
-SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # thresholds at which fractions are reported
-
-
 class TailsInfo(InfoPart):
     """What was measured of pile-up tails, or why it is `missing`, and what to draw them from.
 
@@ -212,19 +191,16 @@ class PileUpTails:
     kev
         Tail at the first sample of each measured trace in keV. NaN where it cannot be
         determined.
-    error_kev
-        Standard deviation of the tails in keV.
-    coupled
-        Whether the levels are used in addition to the slopes.
     level_weight
-        Weight of the tail from the level. That of the slope is the complement.
+        Weight of the tail from the level; 0 if levels do not follow the tails. That of the
+        slope is the complement.
     level_error_kev
         Standard deviation of the tail from the level alone, in keV.
     decay_us, decay_error_us
         Decay time of the tails and its error in us. The error is None if the decay time
         is that of the pulses' tails.
-    baseline_adc, adc_per_kev
-        Level of an empty baseline in ADC counts, and gain in ADC counts per keV.
+    level_adc, adc_per_kev
+        Most frequent level of a baseline in ADC counts, and gain in ADC counts per keV.
     widest_adc
         Maximum RMS, about its tail, of a baseline without another pulse.
     fit
@@ -236,13 +212,11 @@ class PileUpTails:
     """
 
     kev: FloatArray
-    error_kev: float
-    coupled: bool
     level_weight: float
     level_error_kev: float
     decay_us: float
     decay_error_us: float | None
-    baseline_adc: float
+    level_adc: float
     adc_per_kev: float
     widest_adc: float
     fit: RateFit
@@ -258,14 +232,14 @@ class PileUpTails:
         selected: by symmetry, the noise on this side has the power of all noise, while tails
         are mostly on the other side. If few traces have tails, all are selected.
         """
-        if not self.coupled or self.level_weight < LEVEL_TELLS:
-            if float(self.fit.law.share_above(self.error_kev)) < MANY:
-                return np.ones(len(raw), bool)
-            return np.asarray(np.nan_to_num(self.measure(raw), nan=np.inf) <= 0)
-        level = raw.waveforms[:, : self.samples].mean(axis=1)
-        shape = tail_shape(self.samples, self.dt_ns, self.decay_us).mean()
-        highest = self.baseline_adc + self.level_error_kev * self.adc_per_kev * shape
-        return np.asarray(level < highest)
+        if self.level_weight >= LEVEL_TELLS:
+            shape = tail_shape(self.samples, self.dt_ns, self.decay_us).mean()
+            above_kev = self.fit.level_kev / self.level_weight + self.level_error_kev
+            highest = self.level_adc + above_kev * self.adc_per_kev * shape
+            return np.asarray(raw.waveforms[:, : self.samples].mean(axis=1) < highest)
+        if float(self.fit.law.share_above(self.fit.sigma_kev)) < MANY:
+            return np.ones(len(raw), bool)
+        return np.asarray(np.nan_to_num(self.measure(raw), nan=np.inf) <= 0)
 
     @property
     def law(self) -> TailsLaw | None:
@@ -292,43 +266,37 @@ class PileUpTails:
             be used.
         """
         values, gain, tail_decay = usable(baselines)
-        dt_ns, decay = baselines.first.dt_ns, decay_us or tail_decay
-        mean, left, quiet, broadest = _read(values, dt_ns, decay)
+        dt_ns, samples = baselines.first.dt_ns, values.shape[1]
+        decay, error = decay_us or tail_decay, None
+        mean, left, quiet, widest = _read(values, dt_ns, decay)
         level = mode(mean[quiet])
-        tilted = left > LARGE * lower_spread(left[quiet])
-        large = values[quiet & tilted] - level
-        coupled = False
+        tilted = quiet & (left > LARGE * lower_spread(left[quiet]))
+        large, coupled = values[tilted] - level, False
         if len(large) >= MIN_LARGE:  # with DC coupling they are as high as their tilt implies
-            high = large[:, : large.shape[1] // 4].mean(axis=1) / left[quiet & tilted]
+            high = large[:, : samples // 4].mean(axis=1) / left[tilted]
             coupled = 1 / COUPLED < float(np.median(high)) < COUPLED
-        own = own_decay_us(large, dt_ns) if coupled else None
-        error: float | None = None
-        if own is not None and decay_us is None:
-            decay, error = own
-            mean, left, quiet, broadest = _read(values, dt_ns, decay)
-        samples = values.shape[1]
-        height = tail_shape(samples, dt_ns, decay).mean() * gain
-        of_slope, of_level = left / gain, (mean - level) / height
+        if coupled and decay_us is None:  # by their means over both halves
+            half = samples // 2
+            first, second = large[:, :half].mean(axis=1), large[:, half : 2 * half].mean(axis=1)
+            positive = (first > 0) & (second > 0)
+            fall = np.log(first[positive] / second[positive])
+            if len(fall) >= MIN_LARGE and (middle := float(np.median(fall))) > 0:
+                decay = half * dt_ns * 1e-3 / middle
+                spread = 1.2533 * float(median_abs_deviation(fall, scale="normal"))
+                error = decay * spread / middle / float(np.sqrt(len(fall)))
+                mean, left, quiet, widest = _read(values, dt_ns, decay)
+        # tails by slope and by level, weighted by their errors
+        of_slope = left / gain
+        of_level = (mean - level) / (tail_shape(samples, dt_ns, decay).mean() * gain)
         slope_error = lower_spread(of_slope[quiet])
         level_error = lower_spread(of_level[quiet]) if coupled else np.inf
         weight = slope_error**2 / (slope_error**2 + level_error**2) if coupled else 0.0
         kev = (1 - weight) * of_slope + weight * of_level
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
         fit = fit_rate(kev[quiet], guess, decay, baselines.first.energy_kev)
+        kev = np.where(quiet, kev - fit.level_kev, np.nan)
         tails = cls(
-            kev=np.where(quiet, kev - fit.level_kev, np.nan),
-            error_kev=fit.sigma_kev,
-            coupled=coupled,
-            level_weight=weight,
-            level_error_kev=level_error,
-            decay_us=decay,
-            decay_error_us=error,
-            baseline_adc=level + (fit.level_kev / weight * height if coupled else 0.0),
-            adc_per_kev=gain,
-            widest_adc=broadest,
-            fit=fit,
-            samples=samples,
-            dt_ns=dt_ns,
+            kev, weight, level_error, decay, error, level, gain, widest, fit, samples, dt_ns
         )
         # with many tails and no precise rate, the level of empty baselines is not seen either
         most = MAX_FULL if tails.law else MAX_UNSURE
@@ -344,21 +312,18 @@ class PileUpTails:
 
         It is the weighted mean of the tails from slope and level,
 
-        .. math:: A = (1 - w)\, A_{\mathrm{slope}} + w\, \frac{\bar{b} - b_0}{\bar{e}},
+        .. math:: A = (1 - w)\, A_{\mathrm{slope}} + w\, \frac{\bar{b} - b_0}{\bar{e}} - A_0,
 
-        with the mean :math:`\bar{b}` of the baseline, the level :math:`b_0` of an empty one and
-        the mean :math:`\bar{e}` of :math:`e^{-t/\tau}` over the baseline.
+        with the mean :math:`\bar{b}` of the baseline, the most frequent one :math:`b_0`, the
+        mean :math:`\bar{e}` of :math:`e^{-t/\tau}` over the baseline, and the fitted level
+        :math:`A_0` of empty baselines.
         """
         baselines = np.asarray(raw.waveforms[:, : self.samples], float)
         mean, left, width = read_baselines(baselines, self.dt_ns, self.decay_us)
-        kev = (1 - self.level_weight) * left / self.adc_per_kev
-        if self.coupled:
-            shape = tail_shape(self.samples, self.dt_ns, self.decay_us)
-            height = shape.mean() * self.adc_per_kev
-            kev += self.level_weight * (mean - self.baseline_adc) / height
-        else:
-            kev -= self.fit.level_kev
-        return np.where(width <= self.widest_adc, kev, np.nan)
+        shape = tail_shape(self.samples, self.dt_ns, self.decay_us).mean()
+        of_level, weight = (mean - self.level_adc) / shape, self.level_weight
+        kev = ((1 - weight) * left + weight * of_level) / self.adc_per_kev
+        return np.where(width <= self.widest_adc, kev - self.fit.level_kev, np.nan)
 
     def describe(self) -> TailsInfo:
         """Summary: the rate, its error, and fractions of traces above several thresholds."""
@@ -370,8 +335,8 @@ class PileUpTails:
             rate_error_khz=self.fit.rate_error_khz,
             decay_us=self.decay_us,
             decay_error_us=self.decay_error_us,
-            error_kev=self.error_kev,
-            told_by="level and slope" if self.coupled else "slope",
+            error_kev=self.fit.sigma_kev,
+            told_by="level and slope" if self.level_weight else "slope",
             energies="recorded" if self.fit.recorded else "learned from the tails",
             traces=len(with_level),
             percent_above={
@@ -389,10 +354,8 @@ def _read(
 ) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
     """Mean of each baseline, tail, whether it holds no other pulse, and largest RMS."""
     mean, left, width = read_baselines(values, dt_ns, decay_us)
-    finite = width[np.isfinite(width)]
-    if len(finite) < MIN_BASELINES:
-        raise CpunetError(f"only {len(finite)} traces have finite baselines; give more")
+    finite = width[np.isfinite(width)]  # those of all traces that can be prepared
     centre = float(np.median(finite))
     sigma = float(median_abs_deviation(finite, scale="normal"))
-    broadest = centre + max(DISTURBED * sigma, 0.1 * centre)
-    return mean, left, width <= broadest, broadest
+    widest = centre + max(DISTURBED * sigma, 0.1 * centre)
+    return mean, left, width <= widest, widest

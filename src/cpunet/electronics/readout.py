@@ -18,7 +18,7 @@ from scipy import fft
 
 from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum
 from cpunet.electronics.drawn_pile_up import InTracePileUp
-from cpunet.electronics.exponentials import ComplexArray, FloatArray
+from cpunet.electronics.exponentials import FloatArray
 from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
@@ -82,7 +82,6 @@ def linear_response(
             f"{where}: bandwidth_poles_ns means {min(poles):.3g} ns, faster than the pulses' "
             f"grid of {pulses.dt_ns:g} ns; correct it, or simulate them with a shorter period"
         )
-    per_sample = round(ratio)
     n, dt, fine = len(pulses), electronics.dt_ns, pulses.dt_ns
     shift = np.broadcast_to(0.0 if shift_ns is None else np.asarray(shift_ns, float), (n,))
     start = electronics.n_pre * dt + shift
@@ -91,89 +90,54 @@ def linear_response(
     # position of the first clock tick within a fine sample, and the index of that sample
     tick = np.mod(-phase, fine)
     first_tick = np.rint((dt - phase - tick) / fine).astype(np.int64)
-    transfer = electronics.transfer
-    traces = np.zeros((n, electronics.length))
-    _follow(
-        np.ascontiguousarray(pulses.waveforms),
-        _steps(transfer.poles, tick),
-        _steps(transfer.poles, fine - tick),
-        _steps(transfer.poles, np.array([dt]))[0],
-        transfer.residues / dt,
-        first,
-        first_tick,
-        per_sample,
-        traces,
-    )
+    # For y' = p y + x at constant x, y changes over a step by e y + a x with e = exp(p h) - 1,
+    # and its integral is a y + b x. Steps end at a tick, begin there, or last a whole sample.
+    transfer, traces = electronics.transfer, np.zeros((n, electronics.length))
+    steps_ns = np.stack([tick, fine - tick, np.full(n, dt)], axis=1)[..., np.newaxis]
+    gain = np.expm1(transfer.poles * steps_ns)
+    a = gain / transfer.poles
+    factors = np.stack([1 + gain, a, (a - steps_ns) / transfer.poles], axis=-1)
+    charge, weights = np.ascontiguousarray(pulses.waveforms), transfer.residues / dt
+    _follow(charge, factors, weights, first, first_tick, round(ratio), traces)
     return traces
-
-
-def _steps(poles: ComplexArray, h_ns: FloatArray) -> ComplexArray:
-    """Propagation factors over steps of `h_ns` at constant input.
-
-    The shape is ``(steps, poles, 3)``. For ``y' = p y + x``, y changes by ``e y + a x`` with
-    ``e = exp(p h) - 1``, and its integral over the step is ``a y + b x``.
-    """
-    h = h_ns[:, None]
-    gain = np.expm1(poles * h)
-    a = gain / poles
-    return np.stack([1 + gain, a, (a - h) / poles], axis=-1)
-
-
-@kernel
-def _advance(
-    state: Any, total: Any, factors: Any, x: float
-) -> None:  # pragma: no cover - compiled
-    for k in range(len(state)):
-        total[k] += factors[k, 1] * state[k] + factors[k, 2] * x
-        state[k] = factors[k, 0] * state[k] + factors[k, 1] * x
-
-
-@kernel
-def _read(total: Any, weights: Any) -> float:  # pragma: no cover - compiled
-    value = 0.0
-    for k in range(len(total)):
-        value += (weights[k] * total[k]).real
-        total[k] = 0.0
-    return value
 
 
 @kernel(parallel=True)
 def _follow(
     pulses: Any,
-    to_tick: Any,
-    from_tick: Any,
-    whole: Any,
+    factors: Any,
     weights: Any,
     first: Any,
     first_tick: Any,
     per_sample: int,
     traces: Any,
 ) -> None:  # pragma: no cover - compiled
-    """Fill each trace: fine steps while charge moves, then whole samples."""
+    """Fill each trace: fine steps while charge moves, each in two parts, then whole samples."""
     n_fine, length = pulses.shape[1], traces.shape[1]
     for i in prange(len(pulses)):
         state = np.zeros(len(weights), np.complex128)
         total = np.zeros(len(weights), np.complex128)
-        row, j = first[i], 0
+        row, j, part = first[i], 0, 0
         while row < length:
             x = float(pulses[i, min(j, n_fine - 1)])
-            _advance(state, total, to_tick[i], x)
-            if j >= first_tick[i] and (j - first_tick[i]) % per_sample == 0:
-                value = _read(total, weights)
+            step = factors[i, part]
+            for k in range(len(state)):
+                total[k] += step[k, 1] * state[k] + step[k, 2] * x
+                state[k] = step[k, 0] * state[k] + step[k, 1] * x
+            since = j - first_tick[i]
+            if part == 2 or (part == 0 and since >= 0 and since % per_sample == 0):
+                value = 0.0
+                for k in range(len(state)):
+                    value += (weights[k] * total[k]).real
+                    total[k] = 0.0
                 if row >= 0:
                     traces[i, row] = value
                 row += 1
-                if j >= n_fine:
-                    break
-            _advance(state, total, from_tick[i], x)
-            j += 1
-        last = float(pulses[i, n_fine - 1])
-        while row < length:
-            _advance(state, total, whole, last)
-            value = _read(total, weights)
-            if row >= 0:
-                traces[i, row] = value
-            row += 1
+                part = 2 if j >= n_fine else 1
+            elif part == 0:
+                part = 1
+            else:
+                part, j = 0, j + 1
 
 
 # Traces are cut from longer ones (8192 samples of 16 ns, down to 8 kHz), so that noise slower
@@ -305,7 +269,7 @@ def draw_other_pulses(
     return added_kev, tails_kev, piled
 
 
-DECAYING_BASELINE, PILE_UP, SATURATED = 1, 2, 4
+FLAGS = {"decaying baseline": 1, "pile-up": 2, "saturated": 4}
 """Bits of a trace's flags. A baseline decays if its tail exceeds the noise RMS."""
 
 
@@ -341,15 +305,21 @@ class RawTraces(Pulses):
     piled_ns: FloatArray
 
 
-def by_height(signal_kev: FloatArray, electronics: Electronics) -> FloatArray:
+def by_height(
+    signal: FloatArray, electronics: Electronics, kev: FloatArray | float = 1.0
+) -> FloatArray:
     """Signals as an amplifier of limited slew rate and a digitiser leave them.
 
     Parameters
     ----------
-    signal_kev
-        Height in keV, shape (pulses, samples).
+    signal
+        Shape ``(pulses, samples)``.
+    kev
+        Height in keV of a signal of 1, a number or of shape ``(pulses, 1)``.
     """
-    result = np.array(signal_kev, float)
+    if electronics.slew_kev_per_ns is None and electronics.nonlinearity is None:
+        return signal
+    result = kev * signal
     if electronics.slew_kev_per_ns is not None:
         limit = electronics.slew_kev_per_ns * electronics.dt_ns
         for i in range(1, result.shape[1]):
@@ -358,17 +328,7 @@ def by_height(signal_kev: FloatArray, electronics: Electronics) -> FloatArray:
     if (off := electronics.nonlinearity) is not None:
         full = electronics.adc_top / electronics.gain_adc_per_kev
         result += off.fraction * full * np.sin(2 * np.pi * off.waves * result / full)
-    return result
-
-
-def of_energy(
-    response: FloatArray, energy_kev: FloatArray, electronics: Electronics
-) -> FloatArray:
-    """Noise-free pulses in units of the charge, with what acts by their height."""
-    if electronics.slew_kev_per_ns is None and electronics.nonlinearity is None:
-        return response
-    kev = energy_kev[:, np.newaxis]
-    return by_height(kev * response, electronics) / kev
+    return result / kev
 
 
 def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
@@ -422,11 +382,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     )
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
-    flag = (
-        np.where(tails_kev > electronics.noise.rms_kev, DECAYING_BASELINE, 0)
-        | np.where(n_piled > 0, PILE_UP, 0)
-        | np.where(beyond.any(axis=1), SATURATED, 0)
-    ).astype(np.uint8)
+    flags = tails_kev > electronics.noise.rms_kev, n_piled > 0, beyond.any(axis=1)
     # the resolution grows with the root of the energy
     fwhm_kev = np.sqrt(electronics.resolution_fwhm_kev**2 / REFERENCE_KEV * energy)
     smeared = np.random.default_rng(int(resolution.integers(2**63)))
@@ -437,8 +393,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         event_number=pulses.event_number,
         peak=pulses.peak,
         t0_ns=np.zeros(n),
-        flag=flag,
-        response=of_energy(response, energy, electronics).astype(np.float32),
+        flag=np.asarray([*FLAGS.values()] @ np.array(flags), np.uint8),
+        response=by_height(response, electronics, energy[:, None]).astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
         tails_kev=tails_kev,

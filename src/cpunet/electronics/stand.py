@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,14 +13,7 @@ import numpy.typing as npt
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
-from cpunet.electronics.readout import (
-    DECAYING_BASELINE,
-    PILE_UP,
-    SATURATED,
-    linear_response,
-    of_energy,
-    read_out,
-)
+from cpunet.electronics.readout import FLAGS, by_height, linear_response, read_out
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_inputs
 from cpunet.pulses.container import Pulses
@@ -45,7 +38,6 @@ STAND = FolderKind(
     command="cpunet stand",
     own=r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz",
 )
-FLAGS = {"decaying baseline": DECAYING_BASELINE, "pile-up": PILE_UP, "saturated": SATURATED}
 # Truth about each measured trace besides its line, in ``data_labels.npz``.
 OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
 MADE = {MADE_BY: f"cpunet stand {cpunet.__version__}"}
@@ -55,7 +47,7 @@ OTHER = LABELS["other"]
 _COARSEST_NS = 4.0
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
 class Stand:
     """A virtual test stand: two sides of independent events, and the truth.
 
@@ -65,21 +57,14 @@ class Stand:
         Folder of its files.
     electronics
         Readout chain of the data and of the truth.
-    n_sim, n_data
-        Numbers of pulses of each side.
-    sim_lines, data_lines
-        The same by line.
-    flags
-        Numbers of disturbed traces by disturbance.
+    counts
+        ``n_sim``, ``n_data``: numbers of pulses of each side; ``sim_lines``, ``data_lines``:
+        the same by line; ``flags``: numbers of disturbed traces by disturbance.
     """
 
     folder: Path
-    electronics: Electronics
-    n_sim: int
-    n_data: int
-    sim_lines: Mapping[str, int]
-    data_lines: Mapping[str, int]
-    flags: Mapping[str, int]
+    electronics: Electronics = field(repr=False)
+    counts: Mapping[str, Any]
 
     @classmethod
     def load(cls, folder: str | Path) -> Self:
@@ -94,7 +79,7 @@ class Stand:
         stored = read_json(path, "give the folder of a stand, or make one with cpunet stand")
         try:
             electronics = checked(Electronics, stored["electronics"], str(path))
-            return cls(Path(folder), electronics, **stored["counts"])
+            return cls(Path(folder), electronics, stored["counts"])
         except (KeyError, TypeError) as error:
             raise CpunetError(f"{path}: damaged; make the stand again") from error
 
@@ -113,14 +98,12 @@ class Stand:
         """The file of noise-free responses of the simulated pulses."""
         return self.folder / "truth.npz"
 
-    def __repr__(self) -> str:
-        return f"<Stand {self.folder}: {self.n_sim} simulated, {self.n_data} measured>"
-
     def __str__(self) -> str:
-        sim, data, flags = map(counted, (self.sim_lines, self.data_lines, self.flags))
+        of = self.counts
+        sim, data, flags = (counted(of[k]) for k in ("sim_lines", "data_lines", "flags"))
         return (
-            f"{self.folder}: sim.lh5: {self.n_sim} pulses ({sim}), with truth.npz\n"
-            f"{self.folder}: data.lh5: {self.n_data} traces ({data}); {flags or 'undisturbed'}"
+            f"{self.folder}: sim.lh5: {of['n_sim']} pulses ({sim}), with truth.npz\n"
+            f"{self.folder}: data.lh5: {of['n_data']} traces ({data}); {flags or 'undisturbed'}"
         )
 
 
@@ -205,7 +188,11 @@ def make_stand(
             f"settings: step_ns = {physics.step_ns:g}: a stand needs steps of at most "
             f"{_COARSEST_NS:g} ns; lower it"
         )
-    fine = {"dt_ns": _fine_ns(chain.dt_ns, physics.step_ns)}
+    # The chain follows pulses of the longest period that is a part of that of the digitiser, of
+    # whole steps, at most 4 ns, and at most half of `dt_ns` unless a step is as long.
+    steps = round(chain.dt_ns / physics.step_ns)
+    parts = (n for n in range(2, steps) if steps % n == 0 and chain.dt_ns <= n * _COARSEST_NS)
+    fine = {"dt_ns": chain.dt_ns / next(parts, steps)}
     physics = checked(SimulationSettings, physics.model_dump() | fine, "settings")
     seeds = np.random.SeedSequence(seed).generate_state(3, np.uint32).tolist()
     source = wanted, physics.source_height_mm, physics.source_radius_mm
@@ -215,13 +202,16 @@ def make_stand(
     with folder_written_aside(Path(out), STAND, force=force) as folder:
         label = _write_sim(folder, sim, chain)
         columns = _write_data(folder, data, seeds[2], chain)
-        flags = {name: int((columns["flag"] & bit > 0).sum()) for name, bit in FLAGS.items()}
-        counts: dict[str, Any] = {
+        lines = (np.bincount(of, minlength=len(LABELS)) for of in (label, columns["label"]))
+        sim_lines, data_lines = (dict(zip(LABELS, of.tolist(), strict=True)) for of in lines)
+        counts = {
             "n_sim": len(label),
             "n_data": len(columns["label"]),
-            "sim_lines": _by_line(label),
-            "data_lines": _by_line(columns["label"]),
-            "flags": flags,
+            "sim_lines": sim_lines,
+            "data_lines": data_lines,
+            "flags": {
+                name: int((columns["flag"] & bit > 0).sum()) for name, bit in FLAGS.items()
+            },
         }
         made = {
             "cpunet": cpunet.__version__,
@@ -233,7 +223,7 @@ def make_stand(
             "counts": counts,
         }
         (folder / MARKER).write_text(json.dumps(made, indent=1) + "\n", encoding="utf-8")
-    return Stand(Path(out), chain, **counts)
+    return Stand(Path(out), chain, counts)
 
 
 @dataclass(frozen=True)
@@ -288,25 +278,6 @@ class Side:
             )
 
 
-def _fine_ns(dt_ns: float, step_ns: float) -> float:
-    """Period of the pulses that the chain follows: whole steps, and a part of `dt_ns`.
-
-    It is the longest of at most 4 ns and, unless a step is as long, half of `dt_ns`.
-
-    Examples
-    --------
-    >>> [_fine_ns(dt_ns, 1.0) for dt_ns in (1, 2, 4, 5, 8, 10, 16)]
-    [1.0, 1.0, 2.0, 1.0, 4.0, 2.0, 4.0]
-    >>> _fine_ns(12.5, 0.5)
-    2.5
-    """
-    steps = round(dt_ns / step_ns)
-    parts = range(2, steps)
-    return dt_ns / next(
-        (n for n in parts if steps % n == 0 and dt_ns <= n * _COARSEST_NS), steps
-    )
-
-
 def _write_sim(folder: Path, side: Side, electronics: Electronics) -> Labels:
     """Write ``sim.lh5`` and the truth of its pulses; return their lines."""
     labels: list[Labels] = []
@@ -329,7 +300,8 @@ def _write_sim(folder: Path, side: Side, electronics: Electronics) -> Labels:
             )
             writer.append(means)
             writer.append_rows(HIT_TABLE, hit_columns(hits))
-            true = of_energy(linear_response(fine, electronics), fine.energy_kev, electronics)
+            true = linear_response(fine, electronics)
+            true = by_height(true, electronics, fine.energy_kev[:, np.newaxis])
             truth.write(true.astype(np.float32).tobytes())
             labels.append(label)
         simulation = {"cpunet": cpunet.__version__, **side.provenance()}
@@ -361,7 +333,7 @@ def _write_data(
             for name in OF_DATA:
                 columns[name].append(getattr(traces, name))
     whole: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
-    saturated = whole["flag"] & SATURATED > 0
+    saturated = whole["flag"] & FLAGS["saturated"] > 0
     if 2 * saturated.sum() > len(saturated):
         raise CpunetError(
             f"electronics {electronics.name}: {saturated.sum()} of {len(saturated)} traces "
@@ -370,7 +342,3 @@ def _write_data(
         )
     np.savez(folder / "data_labels.npz", **whole)
     return whole
-
-
-def _by_line(labels: Labels) -> dict[str, int]:
-    return {name: int((labels == i).sum()) for name, i in LABELS.items()}

@@ -103,6 +103,12 @@ class TailsLaw:
         return np.asarray(np.bincount(row, left, minlength=n), float)
 
 
+def tail_shape(length: int, dt_ns: float, decay_us: float, lead_us: float = 0.0) -> FloatArray:
+    """Decay of a tail that is 1 a time `lead_us` before the first sample, ``(length,)``."""
+    time_us = np.arange(length) * dt_ns * 1e-3 + lead_us
+    return np.asarray(np.exp(-time_us / decay_us), float)
+
+
 def characteristic_exponents(
     u: FloatArray, energies_kev: FloatArray
 ) -> npt.NDArray[np.complex128]:

@@ -37,15 +37,9 @@ class KeptNoise(Stored):
 
     def set_noise(self, noise: BaselineNoise) -> None:
         """Store a measured spectrum."""
-        whole = noise.density_of(record_samples(self.noise_dt_ns))[np.newaxis]
-        continua = whole if noise.kinds is None else noise.kinds
-        lines = np.zeros_like(continua) if noise.lines is None else noise.lines
-        shares = np.ones(1) if noise.shares is None else noise.shares
-        for array, values in (
-            (self.noise_continua, continua),
-            (self.noise_lines, lines),
-            (self.noise_shares, shares),
-        ):
+        given = noise.at(record_samples(self.noise_dt_ns))
+        own: Any = self.noise_continua, self.noise_lines, self.noise_shares
+        for array, values in zip(own, given, strict=True):
             array[...] = 0
             array[: len(values)] = values
         self.n_baselines[...] = noise.n_baselines
@@ -53,20 +47,12 @@ class KeptNoise(Stored):
     @property
     def noise(self) -> BaselineNoise:
         """The noise, to be drawn from."""
-        present = self.noise_shares > 0
-        continua, lines, shares = (
-            array[present].astype(float)
-            for array in (self.noise_continua, self.noise_lines, self.noise_shares)
-        )
-        return BaselineNoise(
-            shares @ (continua + lines),
-            record_samples(self.noise_dt_ns),
-            self.noise_dt_ns,
-            int(self.n_baselines),
-            continua,
-            lines,
-            shares,
-        )
+        present, dt_ns = self.noise_shares > 0, self.noise_dt_ns
+        stored = self.noise_continua, self.noise_lines, self.noise_shares
+        continua, lines, shares = (array[present].astype(float) for array in stored)
+        mean, n = shares @ (continua + lines), int(self.n_baselines)
+        kinds = continua, lines, shares
+        return BaselineNoise(mean, record_samples(dt_ns), dt_ns, n, *kinds)
 
 
 AFTER_NS = 2720.0  # from the half maximum until charge and slow response have arrived
@@ -125,45 +111,35 @@ class LinearInverse(Stored):
             Shape (n, length): pulses within 0 … 1 at the times of the measured ones,
             to be aligned and normalised like simulated ones.  NaN where a window has NaN.
         """
-        sample = self.half_sample(windows)
-        inside = self.region(windows, sample) - self.mean_in
+        sample, inside, _ = self.region(windows)
         # charge is within 0 … 1; ripples beyond that would affect the scale of the pulses
-        pulses = (self.mean_out + inside @ self.weights.T).clip(0, 1)
+        pulses = (self.mean_out + (inside - self.mean_in) @ self.weights.T).clip(0, 1)
         # 0 before the region and 1 after it: a sample on either side stands for the rest
         pulses = np.pad(pulses, ((0, 0), (1, 1)), constant_values=((0, 0), (0, 1)))
         start = 1 + self.before - sample
         whole = stretch(pulses, start, 0, self.length).astype(windows.dtype)
         return whole if self.residual is None else whole + self.residual(whole)
 
-    def half_sample(self, windows: Floats) -> npt.NDArray[np.intp]:
-        """Last sample below half of the maximum before the maximum, shape (n,)."""
-        index = np.arange(windows.shape[1])
-        highest = windows.argmax(axis=1)[:, np.newaxis]
-        below = (windows < self.half_height) & (index < highest)
-        return np.asarray(np.maximum((below * (index + 1)).max(axis=1) - 1, 0))
+    def region(self, windows: Floats) -> tuple[npt.NDArray[np.intp], Values, Values]:
+        """What is translated of windows, shape (n, length).
 
-    def region(self, windows: Floats, sample: npt.NDArray[np.intp]) -> Values:
-        """The translated stretch of each window, with baseline 0 and level 1, float64.
-
-        Parameters
-        ----------
-        windows
-            Shape (n, length).
-        sample
-            Sample of the half maximum of each.
+        Returns
+        -------
+        tuple of array
+            Sample of the half maximum of each: the last below it before the maximum.  The
+            stretch about it with baseline 0 and level 1, float64.  Mean of the tail above that
+            before the pulse, which has become 1.
         """
-        base, level = self.base_and_level(windows, sample)
-        inside = stretch(windows, sample, -self.before, self.after)
-        scale = np.maximum(level, MIN_LEVEL)[:, np.newaxis]
-        return np.asarray((inside - base[:, np.newaxis]) / scale)
-
-    def base_and_level(
-        self, windows: Floats, sample: npt.NDArray[np.intp]
-    ) -> tuple[Values, Values]:
-        """Mean before each pulse, and mean of its tail above that."""
-        base = stretch(windows, sample, *self.baseline).mean(axis=1, dtype=float)
-        tail = stretch(windows, sample, *self.level).mean(axis=1, dtype=float)
-        return base, tail - base
+        index = np.arange(windows.shape[1])
+        below = (windows < self.half_height) & (index < windows.argmax(axis=1, keepdims=True))
+        sample = np.maximum((below * (index + 1)).max(axis=1) - 1, 0)
+        base, tail = (
+            stretch(windows, sample, *ends).mean(axis=1, dtype=float)
+            for ends in (self.baseline, self.level)
+        )
+        inside = stretch(windows, sample, -self.before, self.after) - base[:, np.newaxis]
+        level = tail - base
+        return sample, inside / np.maximum(level, MIN_LEVEL)[:, np.newaxis], level
 
 
 def stretch(pulses: Any, sample: npt.NDArray[np.intp], first: int, stop: int) -> Floats:

@@ -21,6 +21,7 @@ RISE_NS, MODES = 48.0, 28  # of the two poles it begins with; its free smooth mo
 SIZES, REACH_NS = (0.12, 0.024, 0.006), (192.0, 1920.0)
 CURVED_NS, SMOOTH, WHITE = 96.0, 0.35, 3e-4
 NOISE = 3e-3  # of an inverse at first, over the height of a pulse
+LATE_NS = 960.0  # at the end of a window, whose mean is 1
 
 
 class Linear(nn.Module):
@@ -32,18 +33,15 @@ class Linear(nn.Module):
         self.length = record_length(config.length, config.sampled_ns)
         self.padded = padded_length(self.length)
 
-    def spectrum(self) -> Tensor:
-        """Spectrum of the response to a step at sample 0."""
-        raise NotImplementedError
-
     def current(self, charge: Tensor) -> Tensor:
         """Spectra of the current of windows, within records."""
         current = charge.diff(dim=1, prepend=torch.zeros_like(charge[:, :1]))
         spectra: Tensor = torch.fft.rfft(pad(current, (self.before, 0)), self.padded)
         return spectra
 
-    def forward(self, charge: Tensor) -> Tensor:
-        record: Tensor = torch.fft.irfft(self.current(charge) * self.spectrum(), self.padded)
+    def records(self, charge: Tensor, spectrum: Tensor) -> Tensor:
+        """Records behind the response to a step at sample 0 of this spectrum."""
+        record: Tensor = torch.fft.irfft(self.current(charge) * spectrum, self.padded)
         stop, c = self.before + self.config.length, self.config  # of the nominal window
         level = record[:, stop - c.tail_samples : stop].mean(dim=1, keepdim=True)
         return record[:, : self.length] * (c.tail_level / level.clamp_min(0.1))
@@ -60,12 +58,9 @@ class SolvedResponse(Linear):
         self.register_buffer("solved", spectrum, persistent=False)
         self.drifted = response.drifted
 
-    def spectrum(self) -> Tensor:
-        return self.solved
-
     def forward(self, charge: Tensor) -> Tensor:
         moved = torch.from_numpy(self.drifted(charge.detach().cpu().numpy())).to(charge)
-        return super().forward(charge + (moved - charge).detach())
+        return self.records(charge + (moved - charge).detach(), self.solved)
 
 
 class SolvedInverse(nn.Module):
@@ -84,17 +79,16 @@ class SolvedInverse(nn.Module):
 
     def forward(self, windows: Tensor) -> Tensor:
         f, index = self.inverse, torch.arange(windows.shape[1], device=windows.device)
-        with torch.no_grad():  # as `LinearInverse.half_sample`
+        with torch.no_grad():  # as `LinearInverse.region`
             below = (windows < float(f.half_height)) & (index < windows.argmax(1, keepdim=True))
             at = ((below * (index + 1)).amax(dim=1, keepdim=True) - 1).clamp_min(0)
-
-        def span(first: int, stop: int) -> Tensor:
-            places = at + torch.arange(first, stop, device=windows.device)
-            return windows.gather(1, places.clamp(0, len(index) - 1))
-
-        base = span(*f.baseline).mean(dim=1, keepdim=True)
-        level = span(*f.level).mean(dim=1, keepdim=True) - base
-        inside = (span(-f.before, f.after) - base) / level.clamp_min(0.1)
+        inside, before, tail = (
+            windows.gather(1, (at + index.new_tensor(range(*ends))).clamp(0, len(index) - 1))
+            for ends in ((-f.before, f.after), f.baseline, f.level)
+        )
+        base = before.mean(dim=1, keepdim=True)
+        level = tail.mean(dim=1, keepdim=True) - base
+        inside = (inside - base) / level.clamp_min(0.1)
         pulses = (self.mean_out + (inside - self.mean_in) @ self.weights.T).clamp(0, 1)
         whole = pad(pad(pulses, (1, 0)), (0, 1), value=1.0)
         return whole.gather(1, (index - at + f.before + 1).clamp(0, whole.shape[1] - 1))
@@ -147,8 +141,8 @@ class LearnedResponse(Linear):
         free = (self.between @ knots)[: -self.late]
         return torch.cat([free, knots[-1] * torch.exp(rate * late)])
 
-    def spectrum(self) -> Tensor:
-        return self.spectrum_of(self.step())
+    def forward(self, charge: Tensor) -> Tensor:
+        return self.records(charge, self.spectrum_of(self.step()))
 
     def spectrum_of(self, lags: Tensor) -> Tensor:
         """Spectrum of values at lags from the first on."""
@@ -175,6 +169,3 @@ class LearnedInverse(nn.Module):
         base = charge[:, : r.config.baseline_samples].mean(dim=1, keepdim=True)
         late = charge[:, -r.config.samples(LATE_NS) :].mean(dim=1, keepdim=True)
         return (charge - base) / (late - base).clamp_min(0.1)
-
-
-LATE_NS = 960.0  # at the end of a window, whose mean is 1

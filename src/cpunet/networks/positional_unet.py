@@ -17,6 +17,7 @@ rows of 64 and 64 hidden units it has the published 130,817 trainable parameters
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -26,14 +27,14 @@ from cpunet.recipes.schema import GruConfig, PunetConfig
 FIRST_KERNEL, SECOND_KERNEL, SLOPE = 11, 7, 0.01
 
 
-def double_convolution(
-    channels_in: int, channels_out: int, channels_mid: int, residual: bool = False
-) -> nn.Sequential:
-    """Two convolutions, each with a leaky rectifier and, if not in a residual, batch norm."""
+def double_convolution(*channels: int, residual: bool) -> nn.Sequential:
+    """Two convolutions, each with a leaky rectifier and, if not in a residual, batch norm.
+
+    `channels` are those that go in, those between the convolutions, and those that come out.
+    """
     layers: list[nn.Module] = []
-    for i, o, kernel in (
-        (channels_in, channels_mid, FIRST_KERNEL),
-        (channels_mid, channels_out, SECOND_KERNEL),
+    for i, o, kernel in zip(
+        channels, channels[1:], (FIRST_KERNEL, SECOND_KERNEL), strict=False
     ):
         layers += [
             nn.Conv1d(i, o, kernel, padding="same", bias=residual),
@@ -43,28 +44,23 @@ def double_convolution(
     return nn.Sequential(*layers)
 
 
-def positional_map(channels: int, samples: int, offset: int) -> Tensor:
-    """Sines and cosines of the sample index, shape (1, channels, samples).
+class PositionalMap(nn.Module):
+    """Add sines and cosines of the sample index to a layer's output, then drop out.
 
     Channel pairs carry the Transformer's frequencies ``10000 ** (-2k / channels)``
     (Vaswani et al. 2017); `offset` is added to the sample index.
     """
-    position = torch.arange(samples, dtype=torch.float64) + offset
-    pair = torch.arange(0, channels, 2, dtype=torch.float64)
-    phase = 10000.0 ** (-pair / channels)[:, None] * position  # (channels / 2, samples)
-    pairs = torch.stack([phase.sin(), phase.cos()], dim=1)  # (channels / 2, 2, samples)
-    return pairs.flatten(0, 1)[None, :channels].float()
-
-
-class PositionalMap(nn.Module):
-    """Add a positional map to a layer's output, then drop out."""
 
     values: Tensor
 
     def __init__(self, channels: int, samples: int, offset: int, dropout: float) -> None:
         super().__init__()
+        position = torch.arange(samples, dtype=torch.float64) + offset
+        pair = torch.arange(0, channels, 2, dtype=torch.float64)
+        phase = 10000.0 ** (-pair / channels)[:, None] * position  # (channels / 2, samples)
+        pairs = torch.stack([phase.sin(), phase.cos()], dim=1)  # (channels / 2, 2, samples)
+        values = pairs.flatten(0, 1)[None, :channels].float()
         # a function of the architecture, not of the training: not saved
-        values = positional_map(channels, samples, offset)
         self.register_buffer("values", values, persistent=False)
         self.dropout = nn.Dropout(dropout)
 
@@ -98,21 +94,17 @@ class PositionalUNet(nn.Module):
         if length % 16:
             raise ValueError(f"the pulse length {length} is no multiple of 16")
         self.length = length
-
-        def block(channels_in: int, channels_out: int) -> nn.Sequential:
-            return double_convolution(channels_in, channels_out, channels_out, residual)
-
-        self.inlet = block(2 if residual else 1, m)
-        pairs = (m, 2 * m), (2 * m, 4 * m), (4 * m, 8 * m), (8 * m, 8 * m)
-        self.down = nn.ModuleList(block(i, o) for i, o in pairs)
+        self.inlet = double_convolution(2 if residual else 1, m, m, residual=residual)
+        self.down = nn.ModuleList(
+            double_convolution(i, o, o, residual=residual)
+            for i, o in ((m, 2 * m), (2 * m, 4 * m), (4 * m, 8 * m), (8 * m, 8 * m))
+        )
         self.latent_mean = nn.Conv1d(8 * m, 8 * m, 1)
         if not residual:
             self.latent_log_variance = nn.Conv1d(8 * m, 8 * m, 1)
         self.up = nn.ModuleList(
-            [
-                double_convolution(2 * c, o, c, residual)
-                for c, o in ((8 * m, 4 * m), (4 * m, 2 * m), (2 * m, m), (m, m // 2))
-            ]
+            double_convolution(2 * c, c, o, residual=residual)
+            for c, o in ((8 * m, 4 * m), (4 * m, 2 * m), (2 * m, m), (m, m // 2))
         )
         self.outlet = nn.Conv1d(m // 2, 1, 1)
         if residual:
@@ -120,17 +112,16 @@ class PositionalUNet(nn.Module):
             nn.init.zeros_(self.outlet.bias)  # type: ignore[arg-type]
 
         dropout = 0.0 if residual else config.dropout
-
-        def maps(*levels: tuple[int, int, int]) -> nn.ModuleList:
-            return nn.ModuleList(
-                PositionalMap(channels, length // factor, offset, dropout)
-                for channels, factor, offset in levels
-            )
-
-        self.maps_down = maps((m, 1, 0), (2 * m, 2, 0), (4 * m, 4, 0), (8 * m, 8, 0))
+        self.maps_down = nn.ModuleList(
+            PositionalMap(factor * m, length // factor, 0, dropout) for factor in (1, 2, 4, 8)
+        )
         self.map_latent = PositionalMap(8 * m, length // 16, 0, dropout)
-        # no map after the last step up
-        self.maps_up = maps((4 * m, 8, 4 * m), (2 * m, 4, 2 * m), (m, 2, 2 * m))
+        # no map after the last step up; the offsets are those of the paper's network
+        levels = (4 * m, 8, 4 * m), (2 * m, 4, 2 * m), (m, 2, 2 * m)
+        self.maps_up = nn.ModuleList(
+            PositionalMap(channels, length // factor, offset, dropout)
+            for channels, factor, offset in levels
+        )
 
     def forward(
         self,
@@ -246,7 +237,12 @@ class GruDiscriminator(nn.Module):
 
     def forward(self, pulses: Tensor) -> Tensor:
         """Logits, shape (batch,), of pulses or views of shape (batch, samples)."""
-        vectors = self.embedding(self._fraction(pulses))  # (batch, samples, dim)
+        low: Any = pulses.amin(dim=1, keepdim=True)
+        high: Any = pulses.amax(dim=1, keepdim=True).clamp(low + torch.finfo(pulses.dtype).eps)
+        if self.value_range is not None:
+            low, high = self.value_range
+        position = (pulses - low) / (high - low)  # in the table, 0…1
+        vectors = self.embedding(position)  # (batch, samples, dim)
         steps = vectors.unflatten(1, (-1, self.samples_per_step)).flatten(2)
         outputs, final = self.gru(steps)  # (batch, steps, both), (2, batch, hidden)
         final = torch.cat([final[0], final[1]], dim=1)  # (batch, both)
@@ -256,11 +252,3 @@ class GruDiscriminator(nn.Module):
         context = (score * outputs).sum(dim=1)  # (batch, both)
         logits = self.outlet(torch.cat([self.norm(context), final], dim=1))
         return logits[:, 0]  # type: ignore[no-any-return]
-
-    def _fraction(self, x: Tensor) -> Tensor:
-        """Position of each value in the table, 0…1, shape (batch, samples)."""
-        if self.value_range is not None:
-            low, high = self.value_range
-            return (x - low) / (high - low)
-        least, most = x.amin(dim=1, keepdim=True), x.amax(dim=1, keepdim=True)
-        return (x - least) / (most - least).clamp(min=torch.finfo(x.dtype).eps)

@@ -31,6 +31,7 @@ BEGIN, END = 1e-6, 0.999
 LONGEST_US = 3.0  # time before the end from which the factor is constant
 MIN_STRETCH = 0.2
 ROUNDS = 20  # in which a duration converges
+STRETCHES = "drift_stretch", "drift_stretch_per_us"  # names of its terms
 
 
 class DriftClock(Stored):
@@ -84,46 +85,33 @@ class DriftClock(Stored):
         array
             Of the same shape, type and height.
         """
-        highest = windows.max(axis=1, keepdims=True)
-        end = _first(windows >= END * highest)
+        highest, last = windows.max(axis=1, keepdims=True), windows.shape[1] - 1
+        end = (windows >= END * highest).argmax(axis=1, keepdims=True)
         later: Values = np.zeros(end.shape)
         if self.keeps_begin:
-            took = longer = (end - _first(windows > BEGIN * highest) + 1).astype(float)
+            begin = (windows > BEGIN * highest).argmax(axis=1, keepdims=True)
+            took = longer = (end - begin + 1).astype(float)
             for _ in range(ROUNDS):  # of t = u (1 + a + b t)
                 longer = took * self._factor(longer, 1e-3 * dt_ns)
             later = longer - took
-        before = end + later - np.arange(windows.shape[1])
+        before = end + later - np.arange(last + 1)
         source = end - before / self._factor(before, 1e-3 * dt_ns)
-        return at_times(windows, source)
+        # values at these times by cubics (Catmull-Rom); ends are held
+        lower = np.floor(source).clip(0, last)
+        part = (source - lower).clip(0, 1).astype(windows.dtype)
+        a, b, c, d = (
+            np.take_along_axis(windows, (lower.astype(np.intp) + i).clip(0, last), axis=1)
+            for i in (-1, 0, 1, 2)
+        )
+        rise, bend = 0.5 * (c - a), a - 2.5 * b + 2 * c - 0.5 * d
+        skew = 0.5 * (d - a) + 1.5 * (b - c)
+        return np.asarray(b + part * (rise + part * (bend + part * skew)))
 
     def _factor(self, before: Values, dt_us: float) -> Values:
         """Factor of the time of each sample before the end."""
         us = (dt_us * before).clip(0.0, LONGEST_US)
         factor = 1 + sum(term * us**i for i, term in enumerate(self.stretch))
         return np.maximum(factor, MIN_STRETCH)
-
-    def describe(self) -> dict[str, float]:
-        """Fitted values by name, with the unit at the end of the name."""
-        names = ("drift_stretch", "drift_stretch_per_us")
-        return dict(zip(names, self.stretch.tolist(), strict=False))
-
-
-def _first(where: npt.NDArray[np.bool_]) -> npt.NDArray[np.intp]:
-    """First sample of each row for which a condition holds, shape (batch, 1)."""
-    return np.asarray(where.argmax(axis=1))[:, np.newaxis]
-
-
-def at_times(windows: Floats, times: Values) -> Floats:
-    """Values at times in samples, by cubics (Catmull-Rom); ends are held."""
-    last = windows.shape[1] - 1
-    first = np.floor(times).clip(0, last)
-    part, first = (times - first).clip(0, 1).astype(windows.dtype), first.astype(np.intp)
-    a, b, c, d = (
-        np.take_along_axis(windows, (first + i).clip(0, last), axis=1) for i in (-1, 0, 1, 2)
-    )
-    rise, bend = 0.5 * (c - a), a - 2.5 * b + 2 * c - 0.5 * d
-    skew = 0.5 * (d - a) + 1.5 * (b - c)
-    return np.asarray(b + part * (rise + part * (bend + part * skew)))
 
 
 # Charge is zero before a window and constant after it, but decays outlast the record: their
@@ -135,12 +123,6 @@ LATE_NS, MIN_LEFT = (4000.0, 6400.0), 0.01  # whose decay goes on later, and lea
 DRAWS = 64  # of deviations within their errors
 SHARPNESS = 0.5  # to begin with, between means over a period (0) and points (1)
 IMAGES = 3  # images of the spectrum on either side
-
-
-def late_lags(dt_ns: float) -> tuple[int, int]:
-    """Samples from a step between which its decay is that of later, too."""
-    early, late = (round(ns / dt_ns) for ns in LATE_NS)
-    return early, late
 
 
 def deviation_lags(dt_ns: float) -> npt.NDArray[np.intp]:
@@ -266,9 +248,16 @@ class ElectronicsResponse(Stored):
         everywhere = frequency + image  # (images, frequencies), in units of 1/period
         passed = self.bandwidth(2j * math.pi * everywhere / dt_ns)
         passed = passed * (1 + self.sharpness / 24 * (2 * math.pi * everywhere) ** 2)
-        fast = (_spline(everywhere) * passed).sum(axis=0)
+        # spectrum of the cardinal cubic spline (Unser, Aldroubi and Eden, IEEE Trans. Signal
+        # Process. 41 (1993) 821)
+        spline = np.sinc(everywhere) ** 4 * 3 / (2 + np.cos(2 * math.pi * everywhere))
+        fast = (spline * passed).sum(axis=0)
         n_after = math.ceil(padded / MIN_FACTOR) - padding(dt_ns)[0]
-        decays = self.decay(1e-3 * dt_ns * np.arange(n_after, dtype=float))
+        # response of the decays alone to a step of 1
+        time_us = 1e-3 * dt_ns * np.arange(n_after, dtype=float)
+        decays = main = np.exp(-time_us / np.exp(self.log_decay_us))
+        for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True):
+            decays = decays + weight * (np.exp(-time_us / tau) - main)
         whole: npt.NDArray[np.complex128] = fast * scipy.fft.rfft(decays, padded)
         if not self.config.deviations:
             return whole
@@ -281,7 +270,8 @@ class ElectronicsResponse(Stored):
         step[first:], step[: last + 1] = deviation[:-first], deviation[-first:]
         if n_after > last + 1:  # the whole goes on as it does before the end of the windows
             base = scipy.fft.irfft(whole, padded)
-            (early, late), inside = late_lags(dt_ns), base[: last + 1] + deviation[-first:]
+            early, late = (round(ns / dt_ns) for ns in LATE_NS)
+            inside = base[: last + 1] + deviation[-first:]
             rate = math.log(max(inside[late] / inside[early], MIN_LEFT)) / (late - early)
             after = np.exp(rate * np.arange(n_after - last))
             step[last:n_after] = inside[last] * after - base[last:n_after]
@@ -310,14 +300,6 @@ class ElectronicsResponse(Stored):
             slow = slow + weight * (1 / (1 + s * tau) - 1)
         return transfer * slow
 
-    def decay(self, time_us: Values) -> Values:
-        """Response of the decays alone to a step of 1 at time 0, at times from 0 on in µs."""
-        main = np.exp(-time_us / np.exp(self.log_decay_us))
-        step = main
-        for weight, tau in zip(self.decay_weights, self.fast_decays_us, strict=True):
-            step = step + weight * (np.exp(-time_us / tau) - main)
-        return step
-
     def named(self) -> dict[str, tuple[str, float]]:
         """Fitted parameters by name, with the unit at its end: label and value of each.
 
@@ -334,8 +316,8 @@ class ElectronicsResponse(Stored):
         fast = zip(self.fast_decays_us.tolist(), self.decay_weights.tolist(), strict=True)
         for i, (tau, weight) in enumerate(fast, 1):
             values[f"decay_{tau:g}_us"] = f"decay_weights.{i}", weight
-        stretch = {} if self.drift is None else self.drift.describe()
-        for i, (name, value) in enumerate(stretch.items(), 1):
+        stretch = [] if self.drift is None else self.drift.stretch.tolist()
+        for i, (name, value) in enumerate(zip(STRETCHES, stretch, strict=False), 1):
             values[name] = f"drift.stretch.{i}", value
         return values
 
@@ -350,14 +332,6 @@ class ElectronicsResponse(Stored):
         if self.by_height is not None:
             values |= self.by_height.describe(float(self.dt_ns))
         return values
-
-
-def _spline(frequency: Values) -> Values:
-    """Spectrum of the cardinal cubic spline at frequencies in units of the sampling rate.
-
-    Unser, Aldroubi and Eden, IEEE Trans. Signal Process. 41 (1993) 821.
-    """
-    return np.asarray(np.sinc(frequency) ** 4 * 3 / (2 + np.cos(2 * math.pi * frequency)))
 
 
 def padded_length(length: int) -> int:

@@ -92,10 +92,9 @@ def fit_inverse(
     windows, used = prepared.pulses.waveforms, prepared.index
     inverse = LinearInverse(recipe.preparation.length, training)
     inverse.half_height[...] = 0.5 * np.median(windows.max(axis=1))
-    sample = inverse.half_sample(windows)
-    measured, charge = inverse.region(windows, sample), sim[rows[used]].astype(float)
+    sample, measured, level = inverse.region(windows)
+    charge = sim[rows[used]].astype(float)
     wanted = stretch(charge, sample + delay, -inverse.before, inverse.after)
-    _, level = inverse.base_and_level(windows, sample)
     mean_in, mean_out = measured.mean(axis=0), wanted.mean(axis=0)
     noise = _noise_covariance(generator.noise, inverse, mean_in)
     noise *= float(np.mean(energy_kev[rows] ** -2.0)) / float(level.mean()) ** 2

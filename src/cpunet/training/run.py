@@ -26,7 +26,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self, TypeAlias, TypeVar
 
 import numpy as np
-from pydantic import Field, ValidationError, ValidationInfo, field_validator
+from pydantic import Field, TypeAdapter, ValidationError, ValidationInfo, field_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
@@ -242,10 +242,10 @@ class Run(InfoPart):
         tails = None if self.fit is None else self.fit.tails
         if tails is None or tails.drawn is None:
             return None
-        drawn = DrawnTails.of(tails.drawn)
+        drawn = TypeAdapter(DrawnTails).validate_python(tails.drawn)
         if tails.rate_khz > 0:
             return drawn
-        return replace(drawn, law=replace(drawn.law, rate_khz=0.0))
+        return replace(drawn, rate_khz=0.0)
 
     @cached_property
     def records(self) -> list[Record]:

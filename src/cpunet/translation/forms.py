@@ -74,10 +74,10 @@ class Form:
         if options.tails == NONE:
             tails = None
         elif tails is not None and options.tails != LEARNED:
-            tails = tails.uncut(float(options.tails))
+            tails = replace(tails, rate_khz=float(options.tails), passed=None)
         elif tails is not None and adc is not None:
-            tails = tails.uncut()
-        self.tails = tails if tails is not None and tails.law.rate_khz > 0 else None
+            tails = replace(tails, passed=None)
+        self.tails = tails if tails is not None and tails.rate_khz > 0 else None
         self.n_pre, self.length = config.samples_before, config.length
         self.scale: tuple[float, float] | None = None
         self.ends, self.samples = (0, HIGHEST), "f4"

@@ -22,12 +22,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_methods import BaselineMethod
+from cpunet.electronics.baseline_methods import BASELINE_METHODS, BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import Finished, finish
 from cpunet.electronics.measured import noise_of, tails_of
-from cpunet.electronics.superpulses import BASELINE_METHODS
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.progress import stage
@@ -177,7 +176,7 @@ def fit_baseline_methods(
         Methods that cannot be fitted are listed as missing, with the reason.
     """
     result, tails = FittedBaselineMethods(), ren.tails
-    if tails is not None and tails.law.rate_khz <= 0:
+    if tails is not None and tails.rate_khz <= 0:
         tails = None
     measured_tails = None if tails is None else tails_of(data)[0]
     try:
@@ -326,7 +325,7 @@ def translate_all(
 
 def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> FloatArray:
     """Translated windows with noise and pile-up tails as those of the data."""
-    tails = ren.tails if ren.tails is not None and ren.tails.law.rate_khz > 0 else None
+    tails = ren.tails if ren.tails is not None and ren.tails.rate_khz > 0 else None
     return ren.apply(
         pulses.waveforms,
         energy_kev=pulses.energy_kev,
