@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import scipy.linalg
@@ -29,6 +30,8 @@ FOR_DERIVATIVES, OF_BAND = 1536, 100
 # Step in the physics, in which pulses are linear, as a fraction of the reach of a derivative.
 STEP = 0.1
 STEPS, FALL = 12, 0.2  # most of a fit; expected fall of chi-square with which it ends
+# Values without their correlations, given the root of the covariance.
+_white = partial(scipy.linalg.solve_triangular, lower=True)
 
 
 class JointParameters:
@@ -65,7 +68,7 @@ class JointParameters:
         start: ElectronicsResponse,
         modes: Values = NONE,
     ) -> None:
-        self.chain, self.given, self.start = SmoothParameters(response, start), given, start
+        self.chain, self.given = SmoothParameters(response, start), given
         self.coordinates, self.free = coordinates.copy(), list(free)
         self.modes = modes
         self.along: Values = np.empty(0)
@@ -80,7 +83,6 @@ class JointParameters:
         # a prior may lie far from what was simulated, and its centre must be reached
         self.longest = np.maximum(self.widths, np.abs(self.centre - self.vector()))
         self.reach = np.array([nuisance.reach for nuisance in chosen])
-        self.names = tuple(nuisance.name for nuisance in chosen)
         bounds = [n.bounds(physics.nominal(n)) for n in chosen]
         low, high = np.reshape(bounds, (len(chosen), 2)).T
         unlimited = np.full(n_modes, np.inf)
@@ -101,13 +103,6 @@ class JointParameters:
             self.chain.response.set_deviation(self.modes @ self.along)
         self.coordinates = self.coordinates.copy()
         self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
-
-    def basis(self, padded: int) -> Basis:
-        """Changes of the step response with each parameter of the readout."""
-        basis = self.chain.basis(padded)
-        if not len(self.along):
-            return basis
-        return Basis(basis.first, np.column_stack([basis.changes, self.modes]))
 
 
 @dataclass(eq=False)
@@ -151,7 +146,6 @@ class JointProblem:
     knowledge: Callable[[Values], Values] = lambda _: np.empty(0)
     held: bool = False
     weights: Sequence[Values] = ()
-    _roots: list[Values] = field(init=False)
 
     def __post_init__(self) -> None:
         base, preparation = self.nearby.base, self.recipe.preparation
@@ -164,18 +158,12 @@ class JointProblem:
                 f"give no pulse ({counts}); narrow the `prior` of what is free"
             )
         self._first = prepared.align_sample - preparation.samples_before
-        if not self.weights:
-            self.weights = (
-                [functions.covariance(np.cov(functions.data.T)) for functions in self.functions]
-                if self.held
-                else [difference.covariance for difference in self._differences()]
-            )
+        if not self.weights and self.held:
+            self.weights = [of.covariance(np.cov(of.data.T)) for of in self.functions]
+        elif not self.weights:
+            self.weights = [difference.covariance for difference in self._differences()]
         self._roots = [np.asarray(np.linalg.cholesky(of)) for of in self.weights]
-
-    @property
-    def moments(self) -> int:
-        """Number of compared functions in all bands."""
-        return sum(len(root) for root in self._roots)
+        self.moments = sum(map(len, self.weights))
 
     @property
     def names(self) -> dict[str, list[str]]:
@@ -206,34 +194,51 @@ class JointProblem:
         Pulls are deviations of the functions in standard deviations; they are correlated.
         """
         differences = self._differences()
-        deviations = self._stacked(self.parameters.vector(), differences)[: self.moments]
+        deviations = self.residuals(self.parameters.vector(), differences)[: self.moments]
         pulls = [
             difference.values / np.sqrt(weights.diagonal())
             for difference, weights in zip(differences, self.weights, strict=True)
         ]
         return float(deviations @ deviations), np.concatenate(pulls)
 
-    def fitted(self, count: Callable[[float], None] = lambda _: None) -> Parabola:
+    def fitted(self) -> Parabola:
         """Set the parameters to the minimum."""
-        return minimum(self.parameters, self._parabola, STEPS, FALL, count)
 
-    def _parabola(self, place: Values) -> Parabola:
-        residuals, jacobian, _ = self.both(place)
-        own = np.r_[: self.moments, self.moments + len(place) : len(residuals)]  # no priors
-        chi_square = float(residuals[: self.moments] @ residuals[: self.moments])
-        return Parabola(
-            place,
-            chi_square,
-            self.moments,
-            jacobian[own].T @ jacobian[own],
-            float(residuals @ residuals),
-            jacobian.T @ residuals,
-        )
+        def parabola(place: Values) -> Parabola:
+            residuals, jacobian, _ = self.both(place)
+            off = residuals[: self.moments]
+            own = np.r_[: self.moments, self.moments + len(place) : len(residuals)]  # no priors
+            return Parabola(
+                place,
+                float(off @ off),
+                self.moments,
+                jacobian[own].T @ jacobian[own],
+                float(residuals @ residuals),
+                jacobian.T @ residuals,
+            )
 
-    def residuals(self, vector: Values) -> Values:
-        """Uncorrelated deviations of the functions, priors and further knowledge."""
-        self.parameters.set(vector)
-        return self._stacked(vector, self._differences())
+        return minimum(self.parameters, parabola, STEPS, FALL, lambda _: None)
+
+    def residuals(
+        self, vector: Values, differences: Sequence[Difference] | None = None
+    ) -> Values:
+        """Uncorrelated deviations of the functions, priors and further knowledge.
+
+        Where the differences are given, the parameters are those of the vector already.
+        """
+        parameters = self.parameters
+        if differences is None:
+            parameters.set(vector)
+            differences = self._differences()
+        rows = [
+            *(_white(of, d.values) for of, d in zip(self._roots, differences, strict=True)),
+            (vector - parameters.centre) / parameters.widths,
+            self.knowledge(parameters.coordinates),
+        ]
+        if self.held:
+            moved = (parameters.coordinates - self.nearby.centre)[parameters.free]
+            rows.append(HOLD * moved / parameters.reach)
+        return np.concatenate(rows)
 
     def both(self, vector: Values) -> tuple[Values, Values, tuple[Values, Values]]:
         """Residuals, their derivatives, and both of parts of the events.
@@ -262,34 +267,24 @@ class JointProblem:
         if self.held:
             columns = np.concatenate([columns, np.diag(HOLD / parameters.reach)])
         rows.append(np.pad(columns, ((0, 0), (parameters.n_chain, 0))))
-        return self._stacked(vector, differences), np.concatenate(rows), (slopes, values)
-
-    def _stacked(self, vector: Values, differences: Sequence[Difference]) -> Values:
-        parameters = self.parameters
-        rows = [
-            *(_white(of, d.values) for of, d in zip(self._roots, differences, strict=True)),
-            (vector - parameters.centre) / parameters.widths,
-            self.knowledge(parameters.coordinates),
-        ]
-        if self.held:
-            moved = (parameters.coordinates - self.nearby.centre)[parameters.free]
-            rows.append(HOLD * moved / parameters.reach)
-        return np.concatenate(rows)
+        return self.residuals(vector, differences), np.concatenate(rows), (slopes, values)
 
     def _differences(self, *, slopes: bool = False) -> list[Difference]:
         """Differences of each band at the current parameters, with derivatives if asked."""
         parameters, at = self.parameters, self.parameters.coordinates
-        padded = self.functions[0].sides.padded
+        padded, basis, changes = self.functions[0].sides.padded, None, list[FloatArray]()
         transfer = parameters.chain.response.transfer(padded)
-        if not slopes:
-            return [functions.difference(transfer) for functions in self.here()]
-        most, steps = events(self.functions), STEP * parameters.reach
-        windows = self.windows(at, most)
-        changes = [
-            (self.windows(at + step * np.eye(len(at))[i], most) - windows) / np.float32(step)
-            for i, step in zip(parameters.free, steps, strict=True)
-        ]
-        basis, differences = parameters.basis(padded), []
+        if slopes:
+            most, steps = events(self.functions), STEP * parameters.reach
+            windows = self.windows(at, most)
+            for i, step in zip(parameters.free, steps, strict=True):
+                moved = self.windows(at + step * np.eye(len(at))[i], most)
+                changes.append((moved - windows) / np.float32(step))
+            basis = parameters.chain.basis(padded)
+            if len(parameters.along):
+                columns = [basis.changes, parameters.modes]
+                basis = Basis(basis.first, np.column_stack(columns))
+        differences = []
         for functions in self.here():
             own = [each[functions.sides.rows] for each in changes]
             differences.append(functions.difference(transfer, basis, own))
@@ -307,13 +302,7 @@ class JointProblem:
         the pulses, by whole samples, every step would give some pulses other noise.
         """
         length = self.recipe.preparation.length
-        windows: FloatArray = cut(self.nearby.at(coordinates, most), self._first, length)
-        return windows
-
-
-def _white(root: Values, values: Values) -> Values:
-    """Values without their correlations, given the root of the covariance."""
-    return np.asarray(scipy.linalg.solve_triangular(root, values, lower=True))
+        return np.asarray(cut(self.nearby.at(coordinates, most), self._first, length))
 
 
 def events(functions: Sequence[SlicedJoint]) -> int:

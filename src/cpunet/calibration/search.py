@@ -21,7 +21,7 @@ from cpunet.calibration.joint_problem import JointParameters, JointProblem, even
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
 from cpunet.calibration.result import BEYOND_CHANCE, described
-from cpunet.calibration.sampling import of_events
+from cpunet.calibration.sampling import of_parts, of_weights
 from cpunet.calibration.sliced_functions import SlicedJoint
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -82,21 +82,21 @@ class Search:
 
     def __post_init__(self) -> None:
         self._sides = self.sets.sides()
-        several = len(self._sides) > 1
-        self._bands = [name if several else "" for name in self.sets.names]
-        self._functions = self._wide(1.0)
+        self._functions = self._compared(1.0)
         nuisances = self.simulator.physics.nuisances
-        self._all = list(range(len(nuisances)))
+        self._all, self._simulated = list(range(len(nuisances))), np.zeros(len(nuisances))
         self._first = [i for i in self._all if self.chosen or nuisances[i].first]
         dt_ns = self.simulator.physics.settings.dt_ns
         self._start = ElectronicsResponse(self.recipe.matching.generator, dt_ns)
         with_decay(self._start, self.sets.tail_slope)
         self._modes = NONE
+        # of a usual search: derivatives take two each, of the first parameters, and of all
+        self.simulations = USUAL_ROUNDS + 3 + 2 * (len(self._first) + len(self._all))
 
     def plan(self) -> Linear:
         """What the pulses say of all parameters that may become free, before a fit."""
         few = first(self._functions)
-        nearby = Nearby.about(self.simulator, np.zeros(self._n), [])
+        nearby = Nearby.about(self.simulator, self._simulated)
         nearby = nearby.again(self._all, events(few))
         return self._looked(self._problem(self._chain(), nearby, self._all, few))
 
@@ -108,19 +108,17 @@ class Search:
         CpunetError
             If pulses cannot be simulated for the detector as given.
         """
-        nearby = Nearby.about(self.simulator, np.zeros(self._n), self._first)
+        nearby = Nearby.about(self.simulator, self._simulated).again(self._first)
         response = self._chain()
         before = self._problem(response, nearby, [], held=True)
         chi_square, _ = before.compared()
         self._tell("as simulated", before, chi_square)
-        free = self._first_free(response, nearby)
-        problem, end = self._from_far(response, nearby, free)
+        problem, end = self._from_far(response, nearby)
         if end.chi_square > POOR * problem.moments:  # as if the readout rings
             self._tell("without deviations", problem, end.chi_square, end)
             response = self._deviated(before, chi_square) or response
-            free = self._first_free(response, nearby)
-            problem, end = self._from_far(response, nearby, free)
-        more, last = 0, np.zeros(self._n)
+            problem, end = self._from_far(response, nearby)
+        free, more, last = problem.parameters.free, 0, self._simulated
         for number in range(1, ROUNDS + 1):
             if number > 1:
                 problem = self._problem(response, nearby, free)
@@ -152,28 +150,22 @@ class Search:
         return self._ended(problem, before, examined, rounds=number, settled=settled)
 
     def _from_far(
-        self, response: ElectronicsResponse, nearby: Nearby, free: Sequence[int]
+        self, response: ElectronicsResponse, nearby: Nearby
     ) -> tuple[JointProblem, Parabola]:
-        """First fit, to some of the pulses, with wider functions first."""
-        at = None
+        """First fit, to some of the pulses, with wider functions first.
+
+        Free are all parameters, if chosen, or those of the first that the pulses determine.
+        """
+        free, at = self._all, None
+        if not self.chosen:
+            problem = self._problem(response, nearby, self._first, first(self._functions))
+            free = [self._first[i] for i in self._looked(problem).begin()]
         for wider in (*WIDER, 1.0):
-            functions = first(self._wide(wider))
+            functions = first(self._compared(wider))
             problem = self._problem(response, nearby, free, functions, held=True, at=at)
             end = problem.fitted()
             response, at = problem.parameters.chain.response, problem.parameters.coordinates
         return problem, end
-
-    @property
-    def simulations(self) -> int:
-        """Number of simulations of a usual search, for the remaining time.
-
-        Derivatives take two each: of the first parameters, and of all.
-        """
-        return USUAL_ROUNDS + 3 + 2 * (len(self._first) + self._n)
-
-    @property
-    def _n(self) -> int:
-        return len(self.simulator.physics.nuisances)
 
     def _chain(self) -> ElectronicsResponse:
         """Fit of the chain alone, with the physics as simulated."""
@@ -181,9 +173,13 @@ class Search:
         few = [sides.of(fitter.training.search_pulses) for sides in self._sides]
         return fit_chain(copy.deepcopy(self._start), few, fitter).response
 
-    def _wide(self, wider: float) -> list[SlicedJoint]:
-        both = zip(self._sides, self._bands, strict=True)
-        return [SlicedJoint(sides, wider, band) for sides, band in both]
+    def _compared(self, wider: float) -> list[SlicedJoint]:
+        """Functions of each band, with bins wider by a factor."""
+        names = self.sets.names if len(self._sides) > 1 else [""]
+        return [
+            SlicedJoint(sides, wider, name)
+            for sides, name in zip(self._sides, names, strict=True)
+        ]
 
     def _problem(
         self,
@@ -194,15 +190,19 @@ class Search:
         *,
         held: bool = False,
         at: Values | None = None,
-        weights: Sequence[Values] = (),
     ) -> JointProblem:
         """Comparison near the point at which pulses were simulated."""
-        response, physics = copy.deepcopy(response), self.simulator.physics
-        at = nearby.centre if at is None else at
-        chain = response, physics, at, free, self.given, self._start
-        parameters = JointParameters(*chain, self._modes)
-        sets = parameters, functions or self._functions, nearby
-        return JointProblem(*sets, self.recipe, self.knowledge, held, weights)
+        parameters = JointParameters(
+            copy.deepcopy(response),
+            self.simulator.physics,
+            nearby.centre if at is None else at,
+            free,
+            self.given,
+            self._start,
+            self._modes,
+        )
+        functions = functions or self._functions
+        return JointProblem(parameters, functions, nearby, self.recipe, self.knowledge, held)
 
     def _deviated(self, problem: JointProblem, chi_square: float) -> ElectronicsResponse | None:
         """The chain with deviations of its step response, if these physics leave too much.
@@ -221,13 +221,6 @@ class Search:
         self._modes = deviated.modes
         return deviated.response
 
-    def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:
-        """Parameters that are free initially."""
-        if self.chosen:
-            return self._all
-        problem = self._problem(response, nearby, self._first, first(self._functions))
-        return [self._first[i] for i in self._looked(problem).begin()]
-
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
         """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""
         nuisances = self.simulator.physics.nuisances
@@ -235,7 +228,7 @@ class Search:
         move = np.clip(moved, -farthest, farthest)
         for _ in range(HALVINGS):
             try:
-                place = nearby.moved(nearby.centre + move)
+                place = Nearby.about(self.simulator, nearby.centre + move, nearby.derivatives)
                 break
             except CpunetError as error:  # for example, if the detector is not depleted
                 log.info(f"{error}; going half as far")
@@ -285,24 +278,23 @@ class Search:
             np.array(halves)[:, : problem.moments],
             parameters.coordinates[parameters.free],
             parameters.widths,
-            sum(functions.pairs for functions in problem.functions),
+            # half of the harmonic mean of both sides
+            sum(1 / (1 / len(of.sides) + 1 / len(of.sides.data)) for of in problem.functions),
         )
 
     def _ended(
-        self,
-        problem: JointProblem,
-        before: JointProblem,
-        linear: Linear,
-        **facts: Any,
+        self, problem: JointProblem, before: JointProblem, linear: Linear, **facts: Any
     ) -> tuple[JointProblem, CalibratedPhysics]:
         """The result, without the sampling noise of the simulated events."""
-        mean, spread = problem.by_chance
+        parameters, (mean, spread) = problem.parameters, problem.by_chance
         # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
         scale = float(np.sqrt(max(1.0, problem.compared()[0] / (mean + 2 * spread))))
-        move, covariance = of_events(problem, scale)
-        parameters, physics = problem.parameters, self.simulator.physics
-        moved = np.clip(parameters.vector() + move, parameters.low, parameters.high)
-        parameters.set(moved)
+        vector = parameters.vector()
+        _, jacobian, parts = problem.both(vector)
+        n = sum(len(of.sides) + len(of.sides.data) for of in problem.functions)
+        factor = scale**2 * of_weights(n, mean, len(vector))
+        move, covariance = of_parts(jacobian, *parts, factor)
+        parameters.set(np.clip(parameters.vector() + move, parameters.low, parameters.high))
         (chi_before, pulls_before), (chi_after, pulls_after) = (
             each.compared() for each in (replace(before, weights=problem.weights), problem)
         )
@@ -314,12 +306,13 @@ class Search:
             spread=spread,
             errors_scaled_by=scale,
         )
-        free, lines = parameters.free, []
+        free = parameters.free
         others = [] if self.chosen else [*linear.others(free)]
+        lines = []
         for other in sorted(others, key=lambda other: linear.cost(other)[0])[:MAX_OTHERS]:
             cost, place = linear.cost(other)
             if (rise := cost - linear.cost(free)[0]) < SAME:
-                values = physics.values(place).items()
+                values = self.simulator.physics.values(place).items()
                 sizes = [f"{n} {v:.4g}" for i, (n, v) in enumerate(values) if i in other]
                 lines.append(f"{', '.join(sizes)} (chi-square {rise:+.1f})")
         facts |= {"others": lines, "pulls_before": pulls_before.tolist()}
