@@ -103,7 +103,9 @@ def edge_errors(response: ElectronicsResponse) -> np.ndarray:
         at_half_maximum(one / one.max(), 0.5, 900, RECIPE.matching.training, 0.8)
         for one in (records.astype(float), linear_response(fine, CHAIN))
     )
-    edge = slice(RECIPE.matching.training.before - 100, RECIPE.matching.training.before + 30)
+    training = RECIPE.matching.training
+    half = training.samples(training.before_ns)
+    edge = slice(half - 100, half + 30)
     return np.asarray(np.sqrt(((found - truth)[:, edge] ** 2).mean(axis=1)))
 
 
@@ -125,15 +127,18 @@ def at_half_maximum(
     Windows of ``before + after`` samples around the crossing, moved by fractions of a sample.
     """
     _, sample = crossing(records, level, np.full(len(records), last))
-    first, stop = config.baseline
+    first, stop = map(config.samples, config.baseline_ns)
+    before, after, level_samples = (
+        config.samples(ns) for ns in (config.before_ns, config.after_ns, config.level_ns)
+    )
     # twice, since baseline and level are relative to the crossing of the normalised record
     for _ in range(2):
         base = stretch(records, sample, -first, -stop).mean(axis=1, keepdims=True)
         records = records - base
-        tail = stretch(records, sample, config.after - config.level_samples, config.after)
+        tail = stretch(records, sample, after - level_samples, after)
         records = records * (tail_level / tail.mean(axis=1, keepdims=True))
         time, sample = crossing(records, level, sample + 20)
     start = np.floor(time).astype(int)
     fraction = (time - start)[:, None]
-    window = stretch(records, start, -config.before, config.after + 1)
+    window = stretch(records, start, -before, after + 1)
     return window[:, :-1] * (1 - fraction) + window[:, 1:] * fraction

@@ -150,8 +150,11 @@ def flat(values: Any, joint: str = ".", key: str = "") -> Iterator[tuple[str, An
         yield from flat(value, joint, f"{key}{joint}{name}" if key else str(name))
 
 
-def key_values(set_: Set) -> dict[str, Any]:
+def key_values(set_: Set, *, files: bool = False, folder: Path | None = None) -> dict[str, Any]:
     """Values by key, of a mapping or of ``KEY=VALUE`` words with a value in YAML.
+
+    With `files`, words without ``=`` are YAML files, or some in `folder`.  Later words take
+    precedence.
 
     Examples
     --------
@@ -160,26 +163,15 @@ def key_values(set_: Set) -> dict[str, Any]:
     """
     if isinstance(set_, Mapping):
         return {k: v.tolist() if hasattr(v, "tolist") else v for k, v in set_.items()}
-    values = {}
-    for word in set_:
-        key, _, text = word.partition("=")
-        if not key.strip() or "=" not in word:
-            raise CpunetError(f"{reprlib.repr(word)}: expected KEY=VALUE, as in bias_V=4000")
-        values[key.strip()] = _parsed(text, reprlib.repr(word))
-    return values
-
-
-def words_and_files(given: Set, folder: Path | None = None) -> dict[str, Any]:
-    """Values by key, see `key_values`; words without ``=`` are YAML files, or some in `folder`.
-
-    Later ones take precedence.
-    """
-    if isinstance(given, Mapping):
-        return key_values(given)
     values: dict[str, Any] = {}
-    for word in map(str, given):
-        is_file = "=" not in word and (folder is not None or Path(word).is_file())
-        values |= read_values(word, folder) if is_file else key_values([word])
+    for word in map(str, set_):
+        key, equals, text = word.partition("=")
+        if files and not equals and (folder is not None or Path(word).is_file()):
+            values |= read_values(word, folder)
+        elif equals and key.strip():
+            values[key.strip()] = _parsed(text, reprlib.repr(word))
+        else:
+            raise CpunetError(f"{reprlib.repr(word)}: expected KEY=VALUE, as in bias_V=4000")
     return values
 
 

@@ -330,7 +330,8 @@ def translate_all(
                 comparable[rows] &= np.isfinite(windows).all(axis=1)
             if truth is not None:
                 truth[rows] = clean.pop("truth")
-                squares_of_block = pair_squares(clean, truth[rows], recipe.scores.edge_samples)
+                edge = recipe.scores.samples(recipe.scores.edge_ns)
+                squares_of_block = pair_squares(clean, truth[rows], edge)
                 for name, of_block in squares_of_block.items():
                     squares[name][rows] = of_block
             bar.update(len(block))
