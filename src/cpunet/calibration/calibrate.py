@@ -200,7 +200,7 @@ def _calibrated(
         with stage("Calibrating", search.simulations) as bar:
             search.simulator.simulated = bar.update
             problem, result = search.run()
-        physics, parameters = search.simulator.physics, problem.parameters
+        physics = search.simulator.physics
         if (per := result.chi_square.after / problem.moments) > HOPELESS:
             raise CpunetError(
                 f"{data.path}: no physics near those of {physics.detector.name} "
@@ -209,7 +209,7 @@ def _calibrated(
             )
         for note in result.notes:
             log.info(titled(note))
-        detector, settings = physics.at(parameters.coordinates)
+        detector, settings = physics.at(problem.coordinates)
         for file, config in ((DETECTOR, detector), (SETTINGS, settings)):
             text = yaml_text(config.model_dump(mode="json"))
             (folder / file).write_text(result.comment + text, encoding="utf-8")
@@ -222,7 +222,7 @@ def _calibrated(
         training = recipe.training.model_copy(update={"drift_terms": 0})
         recipe = recipe.model_copy(update={"training": training})
         job = TrainingJob(recipe, peak, seed, "cpu", sim, data)
-        run = train_chain(job, with_settings(parameters.chain.response, deviations=False))
+        run = train_chain(job, with_settings(problem.response, deviations=False))
         facts = {
             "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
             "started": started.isoformat(timespec="seconds"),

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 
 import numpy as np
 import scipy.linalg
 
 from cpunet.calibration.nearby import FloatArray, Nearby, cut
-from cpunet.calibration.nuisances import Physics, Values
+from cpunet.calibration.nuisances import Values
 from cpunet.calibration.sliced_functions import SlicedJoint
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
@@ -34,77 +35,6 @@ STEPS, FALL = 12, 0.2  # most of a fit; expected fall of chi-square with which i
 _white = partial(scipy.linalg.solve_triangular, lower=True)
 
 
-class JointParameters:
-    """Parameters of the chain and free coordinates of the physics as a vector.
-
-    Parameters
-    ----------
-    response
-        The chain.
-    physics
-        All parameters of the physics.
-    coordinates
-        Current coordinates of the physics.
-    free
-        Positions of the free coordinates.
-    given
-        Priors that replace the defaults: value and error by name.
-    start
-        The chain before any fit, on which the priors of the same parameters are centred; those
-        of others on their current values. Centred on the last fit, they would make a result
-        depend on where the first fit ended.
-    modes
-        Deviations of the step response that are free, with priors of 0 ± 1, if the response
-        has any.
-    """
-
-    def __init__(
-        self,
-        response: ElectronicsResponse,
-        physics: Physics,
-        coordinates: Values,
-        free: Sequence[int],
-        given: Mapping[str, tuple[float, float]],
-        start: ElectronicsResponse,
-        modes: Values = NONE,
-    ) -> None:
-        self.chain, self.given = SmoothParameters(response, start), given
-        self.coordinates, self.free = coordinates.copy(), list(free)
-        self.modes = modes
-        self.along: Values = np.empty(0)
-        if response.config.deviations:
-            self.along = np.asarray(np.linalg.lstsq(modes, response.deviation)[0])
-        n_modes = len(self.along)
-        self.n_chain = len(self.chain.labels) + n_modes
-        chosen = [physics.nuisances[i] for i in self.free]
-        centres, widths = physics.priors(given)
-        self.centre = np.r_[self.chain.centre, np.zeros(n_modes), centres[self.free]]
-        self.widths = np.r_[self.chain.widths, np.ones(n_modes), widths[self.free]]
-        # a prior may lie far from what was simulated, and its centre must be reached
-        self.longest = np.maximum(self.widths, np.abs(self.centre - self.vector()))
-        self.reach = np.array([nuisance.reach for nuisance in chosen])
-        bounds = [n.bounds(physics.nominal(n)) for n in chosen]
-        low, high = np.reshape(bounds, (len(chosen), 2)).T
-        unlimited = np.full(n_modes, np.inf)
-        self.low = np.r_[self.chain.low, -unlimited, low]
-        self.high = np.r_[self.chain.high, unlimited, high]
-
-    def vector(self) -> Values:
-        """Current values of all parameters as a vector."""
-        free = self.coordinates[self.free]
-        return np.concatenate([self.chain.vector(), self.along, free])
-
-    def set(self, vector: Values) -> None:
-        """Set all parameters from a vector. Coordinates are limited to their bounds."""
-        n, own = self.n_chain, len(self.chain.labels)
-        self.chain.set(vector[:own])
-        self.along = vector[own:n].copy()
-        if len(self.along):
-            self.chain.response.set_deviation(self.modes @ self.along)
-        self.coordinates = self.coordinates.copy()
-        self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
-
-
 @dataclass(eq=False)
 class JointProblem:
     r"""Residuals of functions in slices of drift time, of priors and of further knowledge.
@@ -117,39 +47,82 @@ class JointProblem:
         - \langle \mathbf{f} \rangle_{\mathrm{data}},
 
     where :math:`C` is the covariance of `cpunet.training.joint`, at the start of the problem,
-    and :math:`\mu_i \pm \sigma_i` are the priors.
+    and :math:`\mu_i \pm \sigma_i` are the priors.  Parameters of the chain, deviations of its
+    step response and free coordinates of the physics are a vector, in this order.
 
     Parameters
     ----------
-    parameters
-        Parameters to be fitted.
+    response
+        The chain, a copy of which is changed.
+    nearby
+        Pulses near a point of the physics.
+    free
+        Positions of the free coordinates.
     functions
         Functions of each band of energies, with its pulses.  Of the simulated ones only rows
         and noise are used.
-    nearby
-        Pulses near a point of the physics.
     recipe
         Recipe with the preparation of simulated pulses.
+    start
+        The chain before any fit, on which the priors of the same parameters are centred; those
+        of others on their current values. Centred on the last fit, they would make a result
+        depend on where the first fit ended.
+    given
+        Priors that replace the defaults: value and error by name.
+    modes
+        Deviations of the step response that are free, with priors of 0 ± 1, if the response
+        has any.
     knowledge
         Deviations from further knowledge of the coordinates, in standard deviations.
     held
         Whether steps beyond the reach of the derivatives are penalised. This is for the first
         steps from far away, where the variation of simulated pulses says nothing about errors.
+    coordinates
+        Coordinates of the physics; by default those of the point.
     weights
         Covariances of another problem with the same functions, to be adopted.
     """
 
-    parameters: JointParameters
-    functions: Sequence[SlicedJoint]
+    response: ElectronicsResponse
     nearby: Nearby
+    free: list[int]
+    functions: Sequence[SlicedJoint]
     recipe: Recipe
+    start: ElectronicsResponse
+    given: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    modes: Values = field(default_factory=lambda: NONE)
     knowledge: Callable[[Values], Values] = lambda _: np.empty(0)
     held: bool = False
+    coordinates: Values = field(default_factory=lambda: NONE)
     weights: Sequence[Values] = ()
 
     def __post_init__(self) -> None:
+        # the vector: its priors, bounds and longest steps
+        self.physics = self.nearby.simulator.physics
+        self.response = copy.deepcopy(self.response)
+        if not len(self.coordinates):
+            self.coordinates = self.nearby.centre
+        self.chain = SmoothParameters(self.response, self.start)
+        self.along: Values = np.empty(0)
+        if self.response.config.deviations:
+            self.along = np.asarray(np.linalg.lstsq(self.modes, self.response.deviation)[0])
+        n_modes = len(self.along)
+        self.n_chain = len(self.chain.labels) + n_modes
+        chosen = [self.physics.nuisances[i] for i in self.free]
+        centres, widths = self.physics.priors(self.given)
+        self.centre = np.r_[self.chain.centre, np.zeros(n_modes), centres[self.free]]
+        self.widths = np.r_[self.chain.widths, np.ones(n_modes), widths[self.free]]
+        # a prior may lie far from what was simulated, and its centre must be reached
+        self.longest = np.maximum(self.widths, np.abs(self.centre - self.vector()))
+        self.reach = np.array([nuisance.reach for nuisance in chosen])
+        bounds = [n.bounds(self.physics.nominal(n)) for n in chosen]
+        low, high = np.reshape(bounds, (len(chosen), 2)).T
+        unlimited = np.full(n_modes, np.inf)
+        self.low = np.r_[self.chain.low, -unlimited, low]
+        self.high = np.r_[self.chain.high, unlimited, high]
+        # windows of the pulses, and the covariances
         base, preparation = self.nearby.base, self.recipe.preparation
-        pulses = Pulses.of(base, dt_ns=self.nearby.simulator.physics.settings.dt_ns)
+        pulses = Pulses.of(base, dt_ns=self.physics.settings.dt_ns)
         prepared = prepare(pulses, preparation, "simulated")
         if len(prepared) < len(base):
             counts = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
@@ -157,13 +130,27 @@ class JointProblem:
                 f"with these physics {len(base) - len(prepared)} of {len(base)} events "
                 f"give no pulse ({counts}); narrow the `prior` of what is free"
             )
-        self._first = prepared.align_sample - preparation.samples_before
+        self._begin = prepared.align_sample - preparation.samples_before
         if not self.weights and self.held:
             self.weights = [of.covariance(np.cov(of.data.T)) for of in self.functions]
         elif not self.weights:
             self.weights = [difference.covariance for difference in self._differences()]
         self._roots = [np.asarray(np.linalg.cholesky(of)) for of in self.weights]
         self.moments = sum(map(len, self.weights))
+
+    def vector(self) -> Values:
+        """Current values of all parameters as a vector."""
+        return np.concatenate([self.chain.vector(), self.along, self.coordinates[self.free]])
+
+    def set(self, vector: Values) -> None:
+        """Set all parameters from a vector. Coordinates are limited to their bounds."""
+        n, own = self.n_chain, len(self.chain.labels)
+        self.chain.set(vector[:own])
+        self.along = vector[own:n].copy()
+        if len(self.along):
+            self.response.set_deviation(self.modes @ self.along)
+        self.coordinates = self.coordinates.copy()
+        self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
 
     @property
     def names(self) -> dict[str, list[str]]:
@@ -194,7 +181,7 @@ class JointProblem:
         Pulls are deviations of the functions in standard deviations; they are correlated.
         """
         differences = self._differences()
-        deviations = self.residuals(self.parameters.vector(), differences)[: self.moments]
+        deviations = self.residuals(self.vector(), differences)[: self.moments]
         pulls = [
             difference.values / np.sqrt(weights.diagonal())
             for difference, weights in zip(differences, self.weights, strict=True)
@@ -217,7 +204,7 @@ class JointProblem:
                 jacobian.T @ residuals,
             )
 
-        return minimum(self.parameters, parabola, STEPS, FALL, lambda _: None)
+        return minimum(self, parabola, STEPS, FALL, lambda _: None)
 
     def residuals(
         self, vector: Values, differences: Sequence[Difference] | None = None
@@ -226,18 +213,17 @@ class JointProblem:
 
         Where the differences are given, the parameters are those of the vector already.
         """
-        parameters = self.parameters
         if differences is None:
-            parameters.set(vector)
+            self.set(vector)
             differences = self._differences()
         rows = [
             *(_white(of, d.values) for of, d in zip(self._roots, differences, strict=True)),
-            (vector - parameters.centre) / parameters.widths,
-            self.knowledge(parameters.coordinates),
+            (vector - self.centre) / self.widths,
+            self.knowledge(self.coordinates),
         ]
         if self.held:
-            moved = (parameters.coordinates - self.nearby.centre)[parameters.free]
-            rows.append(HOLD * moved / parameters.reach)
+            moved = (self.coordinates - self.nearby.centre)[self.free]
+            rows.append(HOLD * moved / self.reach)
         return np.concatenate(rows)
 
     def both(self, vector: Values) -> tuple[Values, Values, tuple[Values, Values]]:
@@ -246,8 +232,7 @@ class JointProblem:
         Shapes are (residuals,), (residuals, parameters), (parts, functions, parameters), and
         (parts, functions).
         """
-        parameters = self.parameters
-        parameters.set(vector)
+        self.set(vector)
         differences = self._differences(slopes=True)
         white = []
         for root, difference in zip(self._roots, differences, strict=True):
@@ -258,32 +243,31 @@ class JointProblem:
             white.append(_white(root, flat).reshape(both.shape))
         parts = np.concatenate(white).swapaxes(0, 1)  # (parts, functions, parameters + 1)
         slopes, values = parts[..., :-1], parts[..., -1]
-        rows = [slopes.mean(axis=0), np.diag(1 / parameters.widths)]
-        at, physics = parameters.coordinates, []
-        for i, step in zip(parameters.free, STEP * parameters.reach, strict=True):
+        rows = [slopes.mean(axis=0), np.diag(1 / self.widths)]
+        at, physics = self.coordinates, []
+        for i, step in zip(self.free, STEP * self.reach, strict=True):
             moved = at + step * np.eye(len(at))[i]
             physics.append((self.knowledge(moved) - self.knowledge(at)) / step)
         columns = np.reshape(physics, (len(physics), len(self.knowledge(at)))).T
         if self.held:
-            columns = np.concatenate([columns, np.diag(HOLD / parameters.reach)])
-        rows.append(np.pad(columns, ((0, 0), (parameters.n_chain, 0))))
+            columns = np.concatenate([columns, np.diag(HOLD / self.reach)])
+        rows.append(np.pad(columns, ((0, 0), (self.n_chain, 0))))
         return self.residuals(vector, differences), np.concatenate(rows), (slopes, values)
 
     def _differences(self, *, slopes: bool = False) -> list[Difference]:
         """Differences of each band at the current parameters, with derivatives if asked."""
-        parameters, at = self.parameters, self.parameters.coordinates
+        at = self.coordinates
         padded, basis, changes = self.functions[0].sides.padded, None, list[FloatArray]()
-        transfer = parameters.chain.response.transfer(padded)
+        transfer = self.response.transfer(padded)
         if slopes:
-            most, steps = events(self.functions), STEP * parameters.reach
+            most, steps = events(self.functions), STEP * self.reach
             windows = self.windows(at, most)
-            for i, step in zip(parameters.free, steps, strict=True):
+            for i, step in zip(self.free, steps, strict=True):
                 moved = self.windows(at + step * np.eye(len(at))[i], most)
                 changes.append((moved - windows) / np.float32(step))
-            basis = parameters.chain.basis(padded)
-            if len(parameters.along):
-                columns = [basis.changes, parameters.modes]
-                basis = Basis(basis.first, np.column_stack(columns))
+            basis = self.chain.basis(padded)
+            if len(self.along):
+                basis = Basis(basis.first, np.column_stack([basis.changes, self.modes]))
         differences = []
         for functions in self.here():
             own = [each[functions.sides.rows] for each in changes]
@@ -292,7 +276,7 @@ class JointProblem:
 
     def here(self) -> list[SlicedJoint]:
         """Functions with the simulated pulses at the current coordinates."""
-        windows = self.windows(self.parameters.coordinates, events(self.functions))
+        windows = self.windows(self.coordinates, events(self.functions))
         return [functions.taking(windows[functions.sides.rows]) for functions in self.functions]
 
     def windows(self, coordinates: Values, most: int | None = None) -> FloatArray:
@@ -302,7 +286,7 @@ class JointProblem:
         the pulses, by whole samples, every step would give some pulses other noise.
         """
         length = self.recipe.preparation.length
-        return np.asarray(cut(self.nearby.at(coordinates, most), self._first, length))
+        return np.asarray(cut(self.nearby.at(coordinates, most), self._begin, length))
 
 
 def events(functions: Sequence[SlicedJoint]) -> int:

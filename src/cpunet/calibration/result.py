@@ -52,18 +52,18 @@ def described(
     facts
         Further fields of `CalibratedPhysics`.
     """
-    parameters, physics = problem.parameters, problem.nearby.simulator.physics
-    n, free, fixed, notes = parameters.n_chain, {}, {}, []
+    physics = problem.physics
+    n, free, fixed, notes = problem.n_chain, {}, {}, []
     # free parameters: value and error in their own units, and whether these can be true
-    centres, priors = physics.priors(parameters.given)
+    centres, priors = physics.priors(problem.given)
     errors = np.sqrt(covariance.diagonal()[n:])
     # sampling noise makes those with all free larger, too
     errors_all = linear.errors()
-    larger = errors / linear.errors(parameters.free)
-    off = (parameters.vector()[n:] - parameters.centre[n:]) / parameters.widths[n:]
-    ends = np.stack([parameters.low, parameters.high])[:, n:] == parameters.vector()[n:]
-    for k, i in enumerate(parameters.free):
-        nuisance, x = physics.nuisances[i], float(parameters.coordinates[i])
+    larger = errors / linear.errors(problem.free)
+    off = (problem.vector()[n:] - problem.centre[n:]) / problem.widths[n:]
+    ends = np.stack([problem.low, problem.high])[:, n:] == problem.vector()[n:]
+    for k, i in enumerate(problem.free):
+        nuisance, x = physics.nuisances[i], float(problem.coordinates[i])
         name, (low, high) = nuisance.name, nuisance.possible
         value, own_error = physics.in_own_unit(i, x, errors[k])
         doubt = f"{abs(off[k]):.1f} errors of its prior from it" if abs(off[k]) > FAR else None
@@ -86,15 +86,15 @@ def described(
             doubt=doubt,
             prior=centre,
             prior_error=width,
-            source="given" if name in parameters.given else nuisance.source,
+            source="given" if name in problem.given else nuisance.source,
         )
     # the others: what would be if they were free
-    here, _ = linear.cost(parameters.free)
+    here, _ = linear.cost(problem.free)
     for i, nuisance in enumerate(physics.nuisances):
-        if i not in parameters.free:
-            more = [*parameters.free, i]
+        if i not in problem.free:
+            more = [*problem.free, i]
             error = chi.errors_scaled_by * linear.errors(more)[-1]
-            value, own_error = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
+            value, own_error = physics.in_own_unit(i, float(problem.coordinates[i]), error)
             fall = here - linear.cost(more)[0]
             fixed[nuisance.name] = FixedParameter(
                 value=value, chi_square_would_fall_by=fall, error_if_free=own_error
@@ -111,7 +111,7 @@ def described(
         if best and falls[best] > NOTABLE:
             rest = f"with {best} free, too, it would fall by {falls[best]:.0f}"
         text = f"a poor fit (expected from statistics: {mean:.2f} ± {spread:.2f}); {rest}"
-    widths = parameters.widths[n:]
+    widths = problem.widths[n:]
     return CalibratedPhysics(
         parameters=free,
         fixed=fixed,

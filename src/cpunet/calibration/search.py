@@ -11,13 +11,14 @@ import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
 from cpunet.calibration.identifiability import Linear
-from cpunet.calibration.joint_problem import JointParameters, JointProblem, events, first
+from cpunet.calibration.joint_problem import JointProblem, events, first
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
 from cpunet.calibration.result import BEYOND_CHANCE, described
@@ -28,7 +29,6 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import POOR, WIDER, Fitter, Parabola, fit_chain
 from cpunet.training.chain_parameters import with_decay, with_settings
-from cpunet.training.comparison import NONE
 from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
 
@@ -89,7 +89,14 @@ class Search:
         dt_ns = self.simulator.physics.settings.dt_ns
         self._start = ElectronicsResponse(self.recipe.matching.generator, dt_ns)
         with_decay(self._start, self.sets.tail_slope)
-        self._modes = NONE
+        # of a chain, pulses near a point, free coordinates, and functions
+        self._problem = partial(
+            JointProblem,
+            recipe=self.recipe,
+            start=self._start,
+            given=self.given,
+            knowledge=self.knowledge,
+        )
         # of a usual search: derivatives take two each, of the first parameters, and of all
         self.simulations = USUAL_ROUNDS + 3 + 2 * (len(self._first) + len(self._all))
 
@@ -110,7 +117,7 @@ class Search:
         """
         nearby = Nearby.about(self.simulator, self._simulated).again(self._first)
         response = self._chain()
-        before = self._problem(response, nearby, [], held=True)
+        before = self._problem(response, nearby, [], self._functions, held=True)
         chi_square, _ = before.compared()
         self._tell("as simulated", before, chi_square)
         problem, end = self._from_far(response, nearby)
@@ -118,14 +125,14 @@ class Search:
             self._tell("without deviations", problem, end.chi_square, end)
             response = self._deviated(before, chi_square) or response
             problem, end = self._from_far(response, nearby)
-        free, more, last = problem.parameters.free, 0, self._simulated
+        free, more, last = list(problem.free), 0, self._simulated
         for number in range(1, ROUNDS + 1):
             if number > 1:
-                problem = self._problem(response, nearby, free)
+                problem = self._problem(response, nearby, free, self._functions)
                 end = problem.fitted()
             self._tell(f"round {number}", problem, end.chi_square, end)
-            response = problem.parameters.chain.response
-            moves = problem.parameters.coordinates - nearby.centre
+            response = problem.response
+            moves = problem.coordinates - nearby.centre
             settled = (
                 number > 1
                 and bool((np.abs(moves[free]) < SETTLED * _errors(problem, end)).all())
@@ -143,7 +150,7 @@ class Search:
             if better is not None:
                 free, more = better, more + 1
             # all that is not free is as simulated
-            aim = np.where(np.isin(self._all, free), problem.parameters.coordinates, 0.0)
+            aim = np.where(np.isin(self._all, free), problem.coordinates, 0.0)
             last = _relaxed(aim - nearby.centre, last)
             nearby = self._moved(nearby, last, free)
         assert examined is not None
@@ -156,15 +163,17 @@ class Search:
 
         Free are all parameters, if chosen, or those of the first that the pulses determine.
         """
-        free, at = self._all, None
+        free, at = self._all, nearby.centre
         if not self.chosen:
             problem = self._problem(response, nearby, self._first, first(self._functions))
             free = [self._first[i] for i in self._looked(problem).begin()]
         for wider in (*WIDER, 1.0):
             functions = first(self._compared(wider))
-            problem = self._problem(response, nearby, free, functions, held=True, at=at)
+            problem = self._problem(
+                response, nearby, free, functions, held=True, coordinates=at
+            )
             end = problem.fitted()
-            response, at = problem.parameters.chain.response, problem.parameters.coordinates
+            response, at = problem.response, problem.coordinates
         return problem, end
 
     def _chain(self) -> ElectronicsResponse:
@@ -181,29 +190,6 @@ class Search:
             for sides, name in zip(self._sides, names, strict=True)
         ]
 
-    def _problem(
-        self,
-        response: ElectronicsResponse,
-        nearby: Nearby,
-        free: Sequence[int],
-        functions: Sequence[SlicedJoint] = (),
-        *,
-        held: bool = False,
-        at: Values | None = None,
-    ) -> JointProblem:
-        """Comparison near the point at which pulses were simulated."""
-        parameters = JointParameters(
-            copy.deepcopy(response),
-            self.simulator.physics,
-            nearby.centre if at is None else at,
-            free,
-            self.given,
-            self._start,
-            self._modes,
-        )
-        functions = functions or self._functions
-        return JointProblem(parameters, functions, nearby, self.recipe, self.knowledge, held)
-
     def _deviated(self, problem: JointProblem, chi_square: float) -> ElectronicsResponse | None:
         """The chain with deviations of its step response, if these physics leave too much.
 
@@ -213,12 +199,12 @@ class Search:
         mean, spread = problem.by_chance
         if chi_square < mean + BEYOND_CHANCE * spread:
             return None
-        chain = with_settings(problem.parameters.chain.response, deviations=False)
+        chain = with_settings(problem.response, deviations=False)
         sides = [functions.sides for functions in problem.here()]
         deviated = with_deviations(chain, sides, lambda _: None)
         if not deviated.response.config.deviations:
             return None
-        self._modes = deviated.modes
+        self._problem = partial(self._problem, modes=deviated.modes)
         return deviated.response
 
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
@@ -257,27 +243,28 @@ class Search:
 
     def _examined(self, problem: JointProblem) -> Linear:
         """What some of the pulses say of all parameters, also of those that are fixed."""
-        parameters = problem.parameters
-        fixed = [i for i in self._all if i not in parameters.free]
+        fixed = [i for i in self._all if i not in problem.free]
         few = first(self._functions, LOOKED_AT_WITH)
         problem.nearby = problem.nearby.again(problem.nearby.outdated(fixed), events(few))
-        chain, at = parameters.chain.response, parameters.coordinates
-        return self._looked(self._problem(chain, problem.nearby, self._all, few, at=at))
+        every = self._problem(
+            problem.response, problem.nearby, self._all, few, coordinates=problem.coordinates
+        )
+        return self._looked(every)
 
     def _looked(self, problem: JointProblem) -> Linear:
         """What all pulses, and each half of them, tell of the free parameters."""
-        parameters, vector = problem.parameters, problem.parameters.vector()
+        vector = problem.vector()
         residuals, jacobian, _ = problem.both(vector)
-        halves = []
+        half, halves = copy.copy(problem), []
         for k in range(2):
-            half = [functions.some(slice(k, None, 2)) for functions in problem.functions]
-            halves.append(replace(problem, functions=half).residuals(vector))
+            half.functions = [of.some(slice(k, None, 2)) for of in problem.functions]
+            halves.append(half.residuals(vector))
         return Linear(
             jacobian,
             residuals,
             np.array(halves)[:, : problem.moments],
-            parameters.coordinates[parameters.free],
-            parameters.widths,
+            problem.coordinates[problem.free],
+            problem.widths,
             # half of the harmonic mean of both sides
             sum(1 / (1 / len(of.sides) + 1 / len(of.sides.data)) for of in problem.functions),
         )
@@ -286,15 +273,15 @@ class Search:
         self, problem: JointProblem, before: JointProblem, linear: Linear, **facts: Any
     ) -> tuple[JointProblem, CalibratedPhysics]:
         """The result, without the sampling noise of the simulated events."""
-        parameters, (mean, spread) = problem.parameters, problem.by_chance
+        mean, spread = problem.by_chance
         # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
         scale = float(np.sqrt(max(1.0, problem.compared()[0] / (mean + 2 * spread))))
-        vector = parameters.vector()
+        vector = problem.vector()
         _, jacobian, parts = problem.both(vector)
         n = sum(len(of.sides) + len(of.sides.data) for of in problem.functions)
         factor = scale**2 * of_weights(n, mean, len(vector))
         move, covariance = of_parts(jacobian, *parts, factor)
-        parameters.set(np.clip(parameters.vector() + move, parameters.low, parameters.high))
+        problem.set(np.clip(problem.vector() + move, problem.low, problem.high))
         (chi_before, pulls_before), (chi_after, pulls_after) = (
             each.compared() for each in (replace(before, weights=problem.weights), problem)
         )
@@ -306,7 +293,7 @@ class Search:
             spread=spread,
             errors_scaled_by=scale,
         )
-        free = parameters.free
+        free = problem.free
         others = [] if self.chosen else [*linear.others(free)]
         lines = []
         for other in sorted(others, key=lambda other: linear.cost(other)[0])[:MAX_OTHERS]:
@@ -322,20 +309,19 @@ class Search:
     def _tell(
         self, when: str, problem: JointProblem, chi_square: float, end: Parabola | None = None
     ) -> None:
-        parameters, physics = problem.parameters, self.simulator.physics
+        physics = self.simulator.physics
         words = [f"{when}: chi-square {chi_square / problem.moments:.2f} per function"]
         errors = np.empty(0) if end is None else _errors(problem, end)
-        for i, error in zip(parameters.free, errors, strict=True):
-            value, own = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
+        for i, error in zip(problem.free, errors, strict=True):
+            value, own = physics.in_own_unit(i, float(problem.coordinates[i]), error)
             words.append(f"{physics.nuisances[i].name} {value:.4g} ± {own:.2g}")
         log.info(", ".join(words))
 
 
 def _errors(problem: JointProblem, end: Parabola) -> Values:
     """Standard deviations of the free coordinates."""
-    parameters = problem.parameters
-    covariance = np.linalg.inv(end.information + np.diag(parameters.widths**-2.0))
-    return np.asarray(np.sqrt(covariance.diagonal())[parameters.n_chain :])
+    covariance = np.linalg.inv(end.information + np.diag(problem.widths**-2.0))
+    return np.asarray(np.sqrt(covariance.diagonal())[problem.n_chain :])
 
 
 def _relaxed(moved: Values, last: Values) -> Values:
