@@ -95,7 +95,7 @@ def test_chi_square_is_that_of_the_definition(problem, functions):
     assert both.compared()[1] == pytest.approx(
         deviation / np.sqrt(covariance.diagonal()), abs=1e-3
     )
-    assert both.moments == sum(map(len, both.names.values())) == len(deviation)
+    assert both.moments == sum(map(len, functions.names.values())) == len(deviation)
 
 
 def test_chance_gives_less_than_one_per_function_because_of_the_diagonal():

@@ -153,11 +153,6 @@ class JointProblem:
         self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
 
     @property
-    def names(self) -> dict[str, list[str]]:
-        """Names of the functions by group."""
-        return {of: own for functions in self.functions for of, own in functions.names.items()}
-
-    @property
     def by_chance(self) -> tuple[float, float]:
         r"""Mean and standard deviation of chi-square if simulation and data agree.
 

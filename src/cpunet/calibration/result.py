@@ -111,6 +111,7 @@ def described(
         if best and falls[best] > NOTABLE:
             rest = f"with {best} free, too, it would fall by {falls[best]:.0f}"
         text = f"a poor fit (expected from statistics: {mean:.2f} ± {spread:.2f}); {rest}"
+    groups = {group: names for of in problem.functions for group, names in of.names.items()}
     widths = problem.widths[n:]
     return CalibratedPhysics(
         parameters=free,
@@ -119,8 +120,8 @@ def described(
         directions=linear.directions([nuisance.name for nuisance in physics.nuisances]),
         chi_square=chi,
         covariance=covariance[n:, n:].tolist(),
-        functions=[*chain.from_iterable(problem.names.values())],
-        groups={group: len(names) for group, names in problem.names.items()},
+        functions=[*chain.from_iterable(groups.values())],
+        groups={group: len(names) for group, names in groups.items()},
         notes=[*notes, f"chi-square is {per:.2f} per function, {text}"],
         **facts,
     )

@@ -87,13 +87,16 @@ class Search:
         self._all, self._simulated = list(range(len(nuisances))), np.zeros(len(nuisances))
         self._first = [i for i in self._all if self.chosen or nuisances[i].first]
         dt_ns = self.simulator.physics.settings.dt_ns
-        self._start = ElectronicsResponse(self.recipe.matching.generator, dt_ns)
-        with_decay(self._start, self.sets.tail_slope)
+        config, training = self.recipe.matching
+        start = with_decay(ElectronicsResponse(config, dt_ns), self.sets.tail_slope)
+        # the chain alone, with the physics as simulated
+        few = [sides.of(training.search_pulses) for sides in self._sides]
+        self._chain = fit_chain(copy.deepcopy(start), few, Fitter(training)).response
         # of a chain, pulses near a point, free coordinates, and functions
         self._problem = partial(
             JointProblem,
             recipe=self.recipe,
-            start=self._start,
+            start=start,
             given=self.given,
             knowledge=self.knowledge,
         )
@@ -105,7 +108,7 @@ class Search:
         few = first(self._functions)
         nearby = Nearby.about(self.simulator, self._simulated)
         nearby = nearby.again(self._all, events(few))
-        return self._looked(self._problem(self._chain(), nearby, self._all, few))
+        return self._looked(self._problem(self._chain, nearby, self._all, few))
 
     def run(self) -> tuple[JointProblem, CalibratedPhysics]:
         """Search until the physics no longer changes: the last comparison, and its result.
@@ -116,7 +119,7 @@ class Search:
             If pulses cannot be simulated for the detector as given.
         """
         nearby = Nearby.about(self.simulator, self._simulated).again(self._first)
-        response = self._chain()
+        response = self._chain
         before = self._problem(response, nearby, [], self._functions, held=True)
         chi_square, _ = before.compared()
         self._tell("as simulated", before, chi_square)
@@ -175,12 +178,6 @@ class Search:
             end = problem.fitted()
             response, at = problem.response, problem.coordinates
         return problem, end
-
-    def _chain(self) -> ElectronicsResponse:
-        """Fit of the chain alone, with the physics as simulated."""
-        fitter = Fitter(self.recipe.matching.training)
-        few = [sides.of(fitter.training.search_pulses) for sides in self._sides]
-        return fit_chain(copy.deepcopy(self._start), few, fitter).response
 
     def _compared(self, wider: float) -> list[SlicedJoint]:
         """Functions of each band, with bins wider by a factor."""
