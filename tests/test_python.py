@@ -167,29 +167,6 @@ def test_a_run_of_a_network(tmp_path):
         run.plot()
 
 
-def test_a_run_is_read_once(home, run, tmp_path, undrawn):
-    opened: list[str] = []
-    listening = [True]
-
-    def listen(event: str, arguments: tuple[object, ...]) -> None:
-        if event == "open" and listening:
-            path = Path(str(arguments[0]))
-            opened.extend([path.name] if path.parent == run.folder else [])
-
-    sys.addaudithook(listen)  # stays until the process ends
-    sides = home / "sim.lh5", home / "raw.lh5"
-    for act in (
-        lambda: cpunet.translate(run.folder, sides[0], tmp_path / "t.lh5", adc=True),
-        lambda: cpunet.validate(run.folder, *sides, tmp_path / "report", baselines=False),
-    ):
-        opened.clear()
-        act()
-        once = ["run.json", "recipe.yaml", "weights.safetensors"]
-        assert sorted(set(opened) - {"losses.jsonl"}) == sorted(once)
-        assert len(opened) == len(set(opened))
-    listening.clear()
-
-
 def test_a_seed_gives_the_same_pulses_in_memory_in_a_file_and_of_arrays(home, run, tmp_path):
     """Of more pulses than have a common seed of the noise."""
     sim = Pulses.concatenate([cpunet.open_pulses(home / "sim.lh5").read()] * 4)
@@ -369,27 +346,6 @@ def test_pulses_in_memory_do_what_files_do(home, tmp_path):
     np.testing.assert_array_equal(as_set.waveforms, two)
     np.testing.assert_array_equal(as_set.energy_kev, sim.energy_kev[:2])
     assert run.iren.translate(data.waveforms[:2]).shape == (2, 800)
-
-
-PEAKS = ("FEP", "SEP", "DEP")
-
-
-@pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> cpunet.Report:
-    """A quick demonstration; do not change it."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("cpunet.demonstration.FEW", "FEP=450,SEP=60,DEP=60")
-        return demo(tmp_path_factory.mktemp("whole") / "demo", quick=True)
-
-
-@pytest.mark.thorough
-def test_a_quick_look_has_three_figures_and_says_what_it_is(whole: cpunet.Report) -> None:
-    assert whole.folder is not None
-    drawn = {path.stem for path in whole.folder.glob("*.svg")}
-    assert drawn == {"SEP_mean_pulse", "SEP_current_amplitude", "SEP_single_pulse"}
-    page = (whole.folder / "report.html").read_text()
-    assert "This is a quick look" in page
-    assert all(peak in page for peak in PEAKS)
 
 
 @pytest.mark.parametrize("part", ["stand", "run", "report"])

@@ -83,7 +83,7 @@ C = TypeVar("C", bound=Config)
 
 def read_settings(
     kind: type[C],
-    name: str | Path | C | None = None,
+    name: str | Path | C,
     set_: Set = (),
     folder: Path | None = None,
 ) -> C:
@@ -92,7 +92,7 @@ def read_settings(
     Parameters
     ----------
     name
-        Name of a YAML file in `folder`, a path, or settings. None: the values of `set_` alone.
+        Name of a YAML file in `folder`, a path, or settings.
     set_
         See `key_values`. Keys of parts are joined by dots, as in ``training.batch_size``.
 
@@ -101,9 +101,8 @@ def read_settings(
     CpunetError
         If the file cannot be read, or a key or value is not allowed.
     """
-    if name is None or isinstance(name, str | Path):
-        source = "settings" if name is None else str(name)
-        values = {} if name is None else read_values(name, folder)
+    if isinstance(name, str | Path):
+        source, values = str(name), read_values(name, folder)
     else:
         source, values = "settings", name.model_dump(exclude_unset=True)
     for key, value in key_values(set_).items():
