@@ -136,7 +136,7 @@ class JointProblem:
         elif not self.weights:
             self.weights = [difference.covariance for difference in self._differences()]
         self._roots = [np.asarray(np.linalg.cholesky(of)) for of in self.weights]
-        self.moments = sum(map(len, self.weights))
+        self.moments, self.errors = sum(map(len, self.weights)), np.zeros(len(self.free))
 
     def vector(self) -> Values:
         """Current values of all parameters as a vector."""
@@ -184,7 +184,7 @@ class JointProblem:
         return float(deviations @ deviations), np.concatenate(pulls)
 
     def fitted(self) -> Parabola:
-        """Set the parameters to the minimum."""
+        """Set the parameters to the minimum, and the errors of the free coordinates there."""
 
         def parabola(place: Values) -> Parabola:
             residuals, jacobian, _ = self.both(place)
@@ -199,7 +199,10 @@ class JointProblem:
                 jacobian.T @ residuals,
             )
 
-        return minimum(self, parabola, STEPS, FALL, lambda _: None)
+        end = minimum(self, parabola, STEPS, FALL, lambda _: None)
+        covariance = np.linalg.inv(end.information + np.diag(self.widths**-2.0))
+        self.errors = np.sqrt(covariance.diagonal())[self.n_chain :]
+        return end
 
     def residuals(
         self, vector: Values, differences: Sequence[Difference] | None = None

@@ -125,7 +125,7 @@ class Search:
         self._tell("as simulated", before, chi_square)
         problem, end = self._from_far(response, nearby)
         if end.chi_square > POOR * problem.moments:  # as if the readout rings
-            self._tell("without deviations", problem, end.chi_square, end)
+            self._tell("without deviations", problem, end.chi_square)
             response = self._deviated(before, chi_square) or response
             problem, end = self._from_far(response, nearby)
         free, more, last = list(problem.free), 0, self._simulated
@@ -133,12 +133,12 @@ class Search:
             if number > 1:
                 problem = self._problem(response, nearby, free, self._functions)
                 end = problem.fitted()
-            self._tell(f"round {number}", problem, end.chi_square, end)
+            self._tell(f"round {number}", problem, end.chi_square)
             response = problem.response
             moves = problem.coordinates - nearby.centre
             settled = (
                 number > 1
-                and bool((np.abs(moves[free]) < SETTLED * _errors(problem, end)).all())
+                and bool((np.abs(moves[free]) < SETTLED * problem.errors).all())
                 and not np.delete(nearby.centre, free).any()
             )
             if settled and not response.config.deviations:
@@ -303,22 +303,13 @@ class Search:
         facts["pulls_after"] = pulls_after.tolist()
         return problem, described(problem, covariance, chi, linear, **facts)
 
-    def _tell(
-        self, when: str, problem: JointProblem, chi_square: float, end: Parabola | None = None
-    ) -> None:
+    def _tell(self, when: str, problem: JointProblem, chi_square: float) -> None:
         physics = self.simulator.physics
         words = [f"{when}: chi-square {chi_square / problem.moments:.2f} per function"]
-        errors = np.empty(0) if end is None else _errors(problem, end)
-        for i, error in zip(problem.free, errors, strict=True):
+        for i, error in zip(problem.free, problem.errors, strict=True):
             value, own = physics.in_own_unit(i, float(problem.coordinates[i]), error)
             words.append(f"{physics.nuisances[i].name} {value:.4g} ± {own:.2g}")
         log.info(", ".join(words))
-
-
-def _errors(problem: JointProblem, end: Parabola) -> Values:
-    """Standard deviations of the free coordinates."""
-    covariance = np.linalg.inv(end.information + np.diag(problem.widths**-2.0))
-    return np.asarray(np.sqrt(covariance.diagonal())[problem.n_chain :])
 
 
 def _relaxed(moved: Values, last: Values) -> Values:
