@@ -414,6 +414,8 @@ class Recipe(Timed):
             raise ValueError("preparation.align_at must be half_height for a matched response")
         if network != (self.discriminator is not None):
             raise ValueError("a discriminator is needed for punet, and for it alone")
+        if network and self.residual is not None:
+            raise ValueError("a residual goes with a response, not with punet")
         if not network and self.residual is None:
             return self
         if (self.cyclegan.generator.linear == "solved") == network:
