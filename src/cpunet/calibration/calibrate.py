@@ -26,7 +26,7 @@ from cpunet.calibration.calibrated_run import (
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Freedom, Physics, depletion, freedom, titled
 from cpunet.calibration.search import Search
-from cpunet.electronics.measured import drawn_like, noise_of, tails_of
+from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
 from cpunet.outputs import folder_written_aside, refuse_existing, refuse_inputs
 from cpunet.processes import keep_freed_memory, one_thread_for_matrices
@@ -258,17 +258,14 @@ def _search(
     looked_at, chosen, priors = free
     physics = Physics(stored.detector, stored.settings, looked_at)
     knowledge = depletion(physics, priors)
-    tails, _ = tails_of(data)
-    drawn = None
-    if tails is not None and tails.law is not None:
-        drawn = drawn_like(tails, data, recipe.preparation)
-    noise = noise_of(data, tails)
+    noise, _ = trace_noise(data, recipe.preparation)
     # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
     some, rng = sim.prepared[rows], np.random.default_rng(seed)
+    pulses = some.pulses, data.prepared.pulses
     search = Search(
         simulator=Simulator(stored.hits[some.index], physics),
-        sets=PulseSets(some.pulses, data.prepared.pulses, noise, recipe, rng, drawn),
+        sets=PulseSets(*pulses, noise.noise, recipe, rng, noise.tails),
         recipe=recipe,
         given=priors,
         knowledge=knowledge,
