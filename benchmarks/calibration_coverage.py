@@ -112,7 +112,7 @@ def experiment(
         )
         search, truth = _search(stand, before, drawn, seed, simulated)
         problem, result = search.run()
-    at, covariance = problem.parameters.coordinates, np.array(result.covariance)
+    at, covariance = problem.coordinates, np.array(result.covariance)
     errors = np.sqrt(covariance.diagonal())
     return {
         "group": group,

@@ -132,15 +132,6 @@ def test_the_links(page):
             assert heading in map(slugify, titles), f"{page.name}: {target}"
 
 
-def test_the_files_to_copy_are_there():
-    for path in re.findall(
-        r"`((?:src|tests|docs)/[\w./-]+)`", (ROOT / "CONTRIBUTING.md").read_text()
-    ):
-        assert (ROOT / path).exists(), path
-    for path in re.findall(r"`((?:\w+/)+\w+\.py)`", (ROOT / "CONTRIBUTING.md").read_text()):
-        assert (ROOT / path).exists() or (ROOT / "src" / "cpunet" / path).exists(), path
-
-
 def slugify(title: str) -> str:
     """The anchor of a heading."""
     words = re.sub(r"[^\w\s-]", "", title.lower()).strip()
@@ -355,7 +346,3 @@ def messages() -> str:
 def test_a_quoted_message_is_one_of_the_program(quoted, messages):
     for part in quoted.removeprefix("warning: ").split("…"):  # its level
         assert part.strip("… ") in messages, f"no message has {part!r}; correct {PAGE.name}"
-
-
-def test_there_are_messages_on_the_page():
-    assert len(QUOTED) > 20

@@ -56,22 +56,6 @@ def test_a_file_is_opened(tmp_path):
         load(tmp_path / "text")
 
 
-@pytest.mark.thorough
-def test_tails_of_a_bench_detector(reference_data: Path):
-    path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
-    file = PulseFile(path, kev_per_adc=calibrated)
-    tails = PileUpTails.of(Baselines.of(file.open().blocks(4096), RECIPE.preparation))
-    lines = info(path, read=FileOptions(kev_per_adc=calibrated), quality=True).lines
-    assert lines[-2:] == tails.describe().in_words()
-    assert tails.fit.recorded
-    assert tails.decay_us == pytest.approx(85, rel=0.04)
-    assert tails.describe().rate_khz == pytest.approx(1.4, abs=0.3)
-    for share in tails.describe().percent_above.values():  # of a thousand traces
-        assert share["measured"] == pytest.approx(share["law"], abs=3)
-    assert len(tails.kev) == 1000
-    assert np.nanmean(tails.kev > 10) == pytest.approx(0.3, abs=0.03)
-
-
 def test_tails_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
@@ -91,7 +75,7 @@ def test_a_run_folder(tmp_path):
     assert lines["pile-up tails"] == "none significant"
 
 
-def test_every_table_of_a_file(tmp_path):
+def test_every_table_of_a_file(tmp_path, capsys):
     file = tmp_path / "channels.h5"
     with h5py.File(file, "w") as made:
         for channel in (3, 7):
@@ -109,6 +93,9 @@ def test_every_table_of_a_file(tmp_path):
     every = info(file, read=FileOptions(table="all", dt_ns=16))
     assert every.ok
     assert str(every).endswith(f"ch7:\n{one}")
+    told = f"{status_of('info', file, '--table', 'all')} {capsys.readouterr().out}"
+    assert told.startswith("1 ")
+    assert "ch7:\nthe sampling period is not in the file; give --dt-ns" in told
 
 
 def test_amplitudes_suggest_a_calibration(tmp_path):
@@ -220,24 +207,6 @@ def test_numbers_of_a_detector():
     assert 0 < low < 300 < 1000 < high
 
 
-@pytest.mark.usefixtures("own_cache")
-def test_the_command_line(tmp_path, capsys):
-    def told(*words: object) -> str:
-        return f"{status_of('info', *words)} {capsys.readouterr().out}"
-
-    assert "bias               2600 V" in told(
-        "ppc", "--set", "grid_mm=0.5", "--set=bias_V=2600"
-    )
-    table = tmp_path / "channels.h5"
-    with h5py.File(table, "w") as made:
-        for name in ("ch3", "ch7"):
-            made[f"{name}/waveform"] = np.zeros((3, 50), np.float32)
-        made["ch7/waveform"].attrs["dt"] = 16.0
-    printed = told(table, "--table", "all")
-    assert printed.startswith("1 ")
-    assert "ch3:\nthe sampling period is not in the file; give --dt-ns" in printed
-
-
 def test_measured_traces_are_described(reference_data: Path):
     """A bench detector, whose properties are seen by eye."""
     told = dict(info(reference_data / "real" / "th228.fcio", quality=True).lines)
@@ -247,3 +216,16 @@ def test_measured_traces_are_described(reference_data: Path):
     assert words == "(RMS of a baseline, median)"  # without energies not in keV
     assert told["left out"].startswith("2 saturated")
     assert told["left out"].endswith(" of 1000 traces")
+
+
+@pytest.mark.thorough
+def test_tails_of_a_bench_detector(reference_data: Path):
+    path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
+    file = PulseFile(path, kev_per_adc=calibrated)
+    tails = PileUpTails.of(Baselines.of(file.open().blocks(4096), RECIPE.preparation))
+    assert tails.fit.recorded
+    assert tails.decay_us == pytest.approx(85, rel=0.04)
+    assert tails.describe().rate_khz == pytest.approx(1.4, abs=0.3)
+    for share in tails.describe().percent_above.values():  # of a thousand traces
+        assert share["measured"] == pytest.approx(share["law"], abs=3)
+    assert np.nanmean(tails.kev > 10) == pytest.approx(0.3, abs=0.03)

@@ -12,10 +12,8 @@ from cpunet.outputs import (
     MARKER,
     FolderKind,
     folder_written_aside,
-    mark,
     refuse_existing,
     refuse_inputs,
-    remove_own,
     require_replaceable,
     written_aside,
 )
@@ -187,15 +185,3 @@ def test_a_linked_folder_is_replaced_in_its_place(tmp_path):
     make(tmp_path / "run", run_json="new")
     assert (tmp_path / "run").is_symlink()
     assert tree(tmp_path / "disk") == {"run/run.json": "new"}
-
-
-def test_own_files_are_removed_alone(tmp_path):
-    run = tmp_path / "run"
-    make(run, run_json="a", log__b="b")
-    (run / "mine").write_text("mine")
-    remove_own(run, RUN)
-    assert tree(run) == {"mine": "mine"}
-    (run / "mine").unlink()
-    mark(run, RUN, listed=False)
-    remove_own(run, RUN)
-    assert not run.exists()

@@ -45,22 +45,6 @@ def test_no_module_imports_from_a_later_room() -> None:
     assert not wrong
 
 
-def test_no_module_gives_a_name_twice() -> None:
-    """The later constant would silently replace the earlier one, in all functions."""
-    twice = []
-    for path in HOUSE.rglob("*.py"):
-        given: list[str] = []
-        for node in ast.parse(path.read_text("utf-8")).body:
-            if isinstance(node, ast.FunctionDef | ast.ClassDef):
-                overloads = any("overload" in ast.unparse(d) for d in node.decorator_list)
-                given += [] if overloads else [node.name]
-            elif isinstance(node, ast.Assign):
-                names = (n for target in node.targets for n in ast.walk(target))
-                given += [name.id for name in names if isinstance(name, ast.Name)]
-        twice += [f"{path.name}: {name}" for name in set(given) if given.count(name) > 1]
-    assert not twice
-
-
 @pytest.fixture
 def installed(monkeypatch, tmp_path):
     """Pretend that this package lies in a folder, with another distribution beside it."""

@@ -1,7 +1,4 @@
-"""Unpaired sets of pulses, one of which went through a chain of known numbers.
-
-Their alignment at half maximum is in plain arrays: what compiled loops are compared with.
-"""
+"""Unpaired sets of pulses, one of which went through a chain of known numbers."""
 
 from __future__ import annotations
 
@@ -13,12 +10,11 @@ import numpy.typing as npt
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.readout import coloured_noise, linear_response
-from cpunet.networks.generators import stretch
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
-from cpunet.recipes.schema import MatchingConfig
+from cpunet.training.aligned import Frame, read
 from synthetic import drifting, load_recipe, two_sites
 
 Floats = npt.NDArray[np.floating]
@@ -97,14 +93,14 @@ def faster(fine: Pulses, factor: float) -> Pulses:
 
 def edge_errors(response: ElectronicsResponse) -> np.ndarray:
     """RMSE on the edge of other pulses than were fitted, against those of the true chain."""
-    fine = charge(200, seed=9)
-    records = response(simulated(fine).waveforms)
+    fine, frame = charge(200, seed=9), Frame.of(RECIPE.matching.training)
     found, truth = (
-        at_half_maximum(one / one.max(), 0.5, 900, RECIPE.matching.training, 0.8)
-        for one in (records.astype(float), linear_response(fine, CHAIN))
+        read(np.asarray(records, float), frame).pulses
+        for records in (response(simulated(fine).waveforms), linear_response(fine, CHAIN))
     )
-    edge = slice(RECIPE.matching.training.before - 100, RECIPE.matching.training.before + 30)
-    return np.asarray(np.sqrt(((found - truth)[:, edge] ** 2).mean(axis=1)))
+    edge = slice(frame.before - 100, frame.before + 30)
+    level = RECIPE.preparation.tail_level  # of prepared pulses
+    return np.asarray(level * np.sqrt(((found - truth)[:, edge] ** 2).mean(axis=1)))
 
 
 def crossing(records: Floats, level: float, last: Ints) -> tuple[Floats, Ints]:
@@ -115,25 +111,3 @@ def crossing(records: Floats, level: float, last: Ints) -> tuple[Floats, Ints]:
     rows = np.arange(len(records))
     low, high = records[rows, before], records[rows, before + 1]
     return before + (level - low) / np.maximum(high - low, 1e-6), before
-
-
-def at_half_maximum(
-    records: Floats, level: float, last: int, config: MatchingConfig, tail_level: float
-) -> Floats:
-    """Records aligned at a level that is crossed, without baseline, scaled to the tail's level.
-
-    Windows of ``before + after`` samples around the crossing, moved by fractions of a sample.
-    """
-    _, sample = crossing(records, level, np.full(len(records), last))
-    first, stop = config.baseline
-    # twice, since baseline and level are relative to the crossing of the normalised record
-    for _ in range(2):
-        base = stretch(records, sample, -first, -stop).mean(axis=1, keepdims=True)
-        records = records - base
-        tail = stretch(records, sample, config.after - config.level_samples, config.after)
-        records = records * (tail_level / tail.mean(axis=1, keepdims=True))
-        time, sample = crossing(records, level, sample + 20)
-    start = np.floor(time).astype(int)
-    fraction = (time - start)[:, None]
-    window = stretch(records, start, -config.before, config.after + 1)
-    return window[:, :-1] * (1 - fraction) + window[:, 1:] * fraction

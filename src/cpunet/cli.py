@@ -231,11 +231,8 @@ class _Lines(logging.Formatter):
         line = with_options(" ".join(super().format(record).split()))
         if record.levelno < logging.WARNING:
             return line
-        return f"{_bold(f'{record.levelname.lower()}:')} {line}"
-
-
-def _bold(text: str) -> str:
-    return f"\033[1m{text}\033[0m" if sys.stderr.isatty() else text
+        level = f"{record.levelname.lower()}:"
+        return f"\033[1m{level}\033[0m {line}" if sys.stderr.isatty() else f"{level} {line}"
 
 
 def _ended_with(error: BaseException, words: Sequence[str], *, debug: bool) -> int:
@@ -269,5 +266,5 @@ def _ended_with(error: BaseException, words: Sequence[str], *, debug: bool) -> i
             f"makers of {DISTRIBUTION}, with what {DEBUG} prints",
             BUG,
         )
-    sys.stderr.write(f"{_bold('error:')} {' '.join(text.split())}\n")
+    log.error(text)
     return status

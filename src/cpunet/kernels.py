@@ -109,12 +109,6 @@ def start_threads() -> int:
     return os.getpid()
 
 
-def threads() -> int:
-    """Number of threads of parallel loops."""
-    start_threads()  # which numba would do by itself, without a care for torch's
-    return int(numba.get_num_threads())
-
-
 def use_threads(count: int) -> None:
     """Set the number of threads of this process, for torch as well if that is imported."""
     os.environ["OMP_NUM_THREADS"] = str(count)  # which torch reads when it is imported later

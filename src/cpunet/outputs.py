@@ -93,45 +93,34 @@ def refuse_picture(target: Path, *inputs: Given, force: bool = False) -> None:
         raise CpunetError(f"{target}: pictures are made as {', '.join(PICTURE_FORMATS)}")
 
 
-def require_kind(target: Path, kind: FolderKind) -> None:
-    """Raise a `CpunetError` if `target` is neither missing, empty nor a folder of this kind."""
+def require_replaceable(target: Path, kind: FolderKind) -> None:
+    """Raise a `CpunetError` unless `target` is missing, empty, or a folder of this kind.
+
+    In the folder only what the marker lists, and the kind's own files, may be.
+    """
     empty = target.is_dir() and not any(target.iterdir())
-    if target.exists() and not (empty or _marker(target)[0] == kind.name):
+    try:
+        content = json.loads((target / MARKER).read_text(encoding="utf-8"))
+        made, files = content["kind"], content["files"]
+    except (OSError, ValueError, LookupError, TypeError):
+        made, files = "", []
+    if target.exists() and not (empty or made == kind.name):
         raise CpunetError(
             f"{target}: is no folder that {kind.command} made, so `force` does not replace it; "
             "choose another name"
         )
-
-
-def require_replaceable(target: Path, kind: FolderKind) -> None:
-    """Raise a `CpunetError` like `require_kind`, or if files of the user are in the folder."""
-    require_kind(target, kind)
-    listed = {MARKER, *_marker(target)[1]}
     for name in _names(target):
-        if name not in listed and not re.fullmatch(kind.own, name):
+        if name not in {MARKER, *files} and not re.fullmatch(kind.own, name):
             raise CpunetError(
                 f"{target}: holds {name}, which cpunet did not write; move it elsewhere, or "
                 "choose another name"
             )
 
 
-def mark(folder: Path, kind: FolderKind, *, listed: bool = True) -> None:
-    """Write the marker into a folder; if `listed`, with all present files as its own."""
-    content = {"kind": kind.name, "files": _names(folder) if listed else []}
+def mark(folder: Path, kind: FolderKind) -> None:
+    """Write the marker into a folder, with all present files as its own."""
+    content = {"kind": kind.name, "files": _names(folder)}
     (folder / MARKER).write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
-
-
-def remove_own(folder: Path, kind: FolderKind) -> None:
-    """Remove the program's files from a folder, and the folder if nothing else is in it."""
-    own = re.compile(f"{kind.own}|{re.escape(MARKER)}")
-    for path in sorted(folder.rglob("*"), reverse=True):  # what is in a folder before it
-        if path.is_dir() and not path.is_symlink():
-            with suppress(OSError):  # somebody's files are in it
-                path.rmdir()
-        elif own.fullmatch(path.relative_to(folder).as_posix()):
-            path.unlink()
-    with suppress(OSError):
-        folder.rmdir()
 
 
 @contextmanager
@@ -214,15 +203,6 @@ def not_written(error: OSError, target: Path, aside: Path) -> CpunetError:
         f"{target}: cannot be written ({reason}{what}); make room there, or choose another "
         "place"
     )
-
-
-def _marker(folder: Path) -> tuple[str, list[str]]:
-    """Kind of a folder, and the files that were listed as its own; nothing of other folders."""
-    try:
-        content = json.loads((folder / MARKER).read_text(encoding="utf-8"))
-        return content["kind"], content["files"]
-    except (OSError, ValueError, LookupError, TypeError):
-        return "", []
 
 
 def _names(folder: Path) -> list[str]:

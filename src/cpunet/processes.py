@@ -22,6 +22,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
+from functools import partial
 from logging.handlers import QueueHandler
 from pathlib import Path
 from queue import SimpleQueue
@@ -183,29 +184,21 @@ def _work(task: Any) -> tuple[Any, list[logging.LogRecord]]:
 _TRIM_THRESHOLD, _MMAP_THRESHOLD = -1, -3  # constants of glibc's malloc.h
 
 
-def give_back_large_arrays() -> None:
-    """Return arrays of a megabyte or more to the system when they are freed.
-
-    For jobs that process files block by block.  By default the C library eventually keeps
-    such arrays on its heap, which becomes fragmented and grows.
-    """
-    _set_thresholds(mmap_bytes=1 << 20, trim_bytes=1 << 17)
-
-
-def keep_freed_memory() -> None:
-    """Let the C library keep all freed memory.
-
-    For trainings.  Every step of a network allocates and frees the same hundreds of megabytes.
-    Fetching them from the system again takes a tenth of the step and more.
-    """
-    _set_thresholds(mmap_bytes=2**31 - 1, trim_bytes=2**31 - 1)
-
-
 def _set_thresholds(mmap_bytes: int, trim_bytes: int) -> None:
+    """Set from which size on the C library gives freed memory back to the system."""
     with suppress(OSError, AttributeError, TypeError):  # another C library
         library = ctypes.CDLL(None)
         library.mallopt(_MMAP_THRESHOLD, mmap_bytes)
         library.mallopt(_TRIM_THRESHOLD, trim_bytes)
+
+
+# For jobs that process files block by block: arrays of a megabyte or more go back to the
+# system.  By default the C library eventually keeps such arrays on its heap, which becomes
+# fragmented and grows.
+give_back_large_arrays = partial(_set_thresholds, 1 << 20, 1 << 17)
+# For trainings: all freed memory stays.  Every step of a network allocates and frees the same
+# hundreds of megabytes; to get them from the system again takes a tenth of the step and more.
+keep_freed_memory = partial(_set_thresholds, 2**31 - 1, 2**31 - 1)
 
 
 @contextmanager

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import difflib
 import json
-import math
 import re
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
@@ -13,6 +12,7 @@ from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar, get_args, get_o
 
 import yaml
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import to_jsonable_python
 
 from cpunet.errors import CpunetError
 
@@ -27,35 +27,16 @@ Fraction = Annotated[float, Field(ge=0, lt=1)]
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML 1.2, in which 4.4e3 and 1e-05 are numbers, and 010 is ten."""
-
-    yaml_implicit_resolvers: ClassVar[Any] = {}  # type: ignore[misc]
+    """YAML in which 4.4e3 and 1e-05 are numbers, as in YAML 1.2."""
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that readers of YAML 1.1 or 1.2 would take for something else."""
+    """Quotes text that `_Loader` would take for a number."""
 
 
-_CORE = {  # scalars of the core schema, with the characters that they begin with
-    "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
-    "bool": (r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
-    "int": (r"[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+", [*"-+0123456789"]),
-    "float": (
-        r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9_]*)?)([eE][-+]?[0-9]+)?"
-        r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
-        [*"-+.0123456789"],
-    ),
-    "merge": ("<<", ["<"]),
-}
-for _tag, (_form, _first) in _CORE.items():
-    for _of in (_Loader, _Dumper):
-        _of.add_implicit_resolver(
-            f"tag:yaml.org,2002:{_tag}", re.compile(f"({_form})$"), _first
-        )
-_Loader.add_constructor(
-    "tag:yaml.org,2002:int",
-    lambda _, node: int(node.value, 0 if node.value[:2] in ("0o", "0x") else 10),
-)
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9_]*)?)[eE][-+]?[0-9]+$")
+for _of in (_Loader, _Dumper):
+    _of.add_implicit_resolver("tag:yaml.org,2002:float", _FLOAT, [*"-+.0123456789"])
 
 Set: TypeAlias = Mapping[str, Any] | Iterable[str]
 
@@ -83,7 +64,7 @@ C = TypeVar("C", bound=Config)
 
 def read_settings(
     kind: type[C],
-    name: str | Path | C | None = None,
+    name: str | Path | C,
     set_: Set = (),
     folder: Path | None = None,
 ) -> C:
@@ -92,7 +73,7 @@ def read_settings(
     Parameters
     ----------
     name
-        Name of a YAML file in `folder`, a path, or settings. None: the values of `set_` alone.
+        Name of a YAML file in `folder`, a path, or settings.
     set_
         See `key_values`. Keys of parts are joined by dots, as in ``training.batch_size``.
 
@@ -101,9 +82,8 @@ def read_settings(
     CpunetError
         If the file cannot be read, or a key or value is not allowed.
     """
-    if name is None or isinstance(name, str | Path):
-        source = "settings" if name is None else str(name)
-        values = {} if name is None else read_values(name, folder)
+    if isinstance(name, str | Path):
+        source, values = str(name), read_values(name, folder)
     else:
         source, values = "settings", name.model_dump(exclude_unset=True)
     for key, value in key_values(set_).items():
@@ -150,8 +130,11 @@ def flat(values: Any, joint: str = ".", key: str = "") -> Iterator[tuple[str, An
         yield from flat(value, joint, f"{key}{joint}{name}" if key else str(name))
 
 
-def key_values(set_: Set) -> dict[str, Any]:
+def key_values(set_: Set, *, files: bool = False, folder: Path | None = None) -> dict[str, Any]:
     """Values by key, of a mapping or of ``KEY=VALUE`` words with a value in YAML.
+
+    With `files`, words without ``=`` are YAML files, or some in `folder`.  Later words take
+    precedence.
 
     Examples
     --------
@@ -160,26 +143,15 @@ def key_values(set_: Set) -> dict[str, Any]:
     """
     if isinstance(set_, Mapping):
         return {k: v.tolist() if hasattr(v, "tolist") else v for k, v in set_.items()}
-    values = {}
-    for word in set_:
-        key, _, text = word.partition("=")
-        if not key.strip() or "=" not in word:
-            raise CpunetError(f"{reprlib.repr(word)}: expected KEY=VALUE, as in bias_V=4000")
-        values[key.strip()] = _parsed(text, reprlib.repr(word))
-    return values
-
-
-def words_and_files(given: Set, folder: Path | None = None) -> dict[str, Any]:
-    """Values by key, see `key_values`; words without ``=`` are YAML files, or some in `folder`.
-
-    Later ones take precedence.
-    """
-    if isinstance(given, Mapping):
-        return key_values(given)
     values: dict[str, Any] = {}
-    for word in map(str, given):
-        is_file = "=" not in word and (folder is not None or Path(word).is_file())
-        values |= read_values(word, folder) if is_file else key_values([word])
+    for word in map(str, set_):
+        key, equals, text = word.partition("=")
+        if files and not equals and (folder is not None or Path(word).is_file()):
+            values |= read_values(word, folder)
+        elif equals and key.strip():
+            values[key.strip()] = _parsed(text, reprlib.repr(word))
+        else:
+            raise CpunetError(f"{reprlib.repr(word)}: expected KEY=VALUE, as in bias_V=4000")
     return values
 
 
@@ -237,13 +209,7 @@ def plain(value: Any) -> Any:
     >>> plain({"a": (1, float("nan"))})
     {'a': [1, None]}
     """
-    if isinstance(value, Mapping):
-        return {str(key): plain(part) for key, part in value.items()}
-    if isinstance(value, list | tuple):
-        return [plain(part) for part in value]
-    if hasattr(value, "tolist"):
-        return plain(value.tolist())
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    return to_jsonable_python(value, inf_nan_mode="null", fallback=lambda array: array.tolist())
 
 
 def yaml_text(values: Any) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from cpunet.calibration.identifiability import Linear
-from cpunet.calibration.joint_problem import JointParameters, JointProblem, first
+from cpunet.calibration.joint_problem import JointProblem, first
 from cpunet.calibration.nearby import Derivative, Nearby, half_maxima
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.sliced_functions import SlicedJoint
@@ -21,7 +21,6 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.chain_fit import Fitter, fit_chain
 from cpunet.training.chain_parameters import with_decay, with_settings
-from cpunet.training.comparison import NONE
 from cpunet.training.joint import SHRUNK
 from cpunet.training.pulse_sets import PulseSets
 from synthetic import load_recipe
@@ -71,18 +70,17 @@ def fitted(start, functions) -> ElectronicsResponse:
 
 @pytest.fixture
 def problem(start, functions, nearby):
-    def made(*, free=(0, 1), at=(0.0, 0.0), few=False, response=start, modes=NONE, **settings):
-        own = copy.deepcopy(response)
-        parameters = JointParameters(own, PHYSICS, np.array(at), free, {}, start, modes)
+    def made(*, free=(0, 1), at=(0.0, 0.0), few=False, response=start, **settings):
         some = first([functions], 300) if few else [functions]
-        return JointProblem(parameters, some, nearby, RECIPE, **settings)
+        settings |= {"coordinates": np.array(at)}
+        return JointProblem(response, nearby, [*free], some, RECIPE, start, **settings)
 
     return made
 
 
 def test_chi_square_is_that_of_the_definition(problem, functions):
     both = problem()
-    response = both.parameters.chain.response
+    response = both.response
     taken = functions.taking(both.windows(np.zeros(2))[functions.sides.rows])
     transfer = response.transfer(taken.sides.padded)
     noisy = taken.sides.noisy(*taken.sides.translated(transfer))
@@ -97,7 +95,7 @@ def test_chi_square_is_that_of_the_definition(problem, functions):
     assert both.compared()[1] == pytest.approx(
         deviation / np.sqrt(covariance.diagonal()), abs=1e-3
     )
-    assert both.moments == sum(map(len, both.names.values())) == len(deviation)
+    assert both.moments == sum(map(len, functions.names.values())) == len(deviation)
 
 
 def test_chance_gives_less_than_one_per_function_because_of_the_diagonal():
@@ -121,21 +119,20 @@ def test_far_from_the_data_only_their_covariance_counts(problem, functions):
 
 def test_priors_and_further_knowledge_follow_the_deviations(problem):
     known = problem(knowledge=lambda coordinates: 7 * coordinates[:1])
-    parameters = known.parameters
-    vector = parameters.vector()
-    vector[parameters.n_chain :] = 1.5, 0.02
+    vector = known.vector()
+    vector[known.n_chain :] = 1.5, 0.02
     found = known.residuals(vector)
     prior = found[known.moments : known.moments + len(vector)]
-    assert prior[parameters.n_chain :] == pytest.approx([1.5 / 3.0, 0.02 / 0.1])
-    assert not prior[: parameters.n_chain].any()
+    assert prior[known.n_chain :] == pytest.approx([1.5 / 3.0, 0.02 / 0.1])
+    assert not prior[: known.n_chain].any()
     assert found[-1] == pytest.approx(10.5)
-    assert parameters.coordinates.tolist() == [1.5, 0.02]
+    assert known.coordinates.tolist() == [1.5, 0.02]
 
 
 def test_what_else_is_known_makes_errors_smaller(problem):
     def linear(one: JointProblem) -> Linear:
-        residuals, jacobian, _ = one.both(one.parameters.vector())
-        halves, widths = np.zeros((2, one.moments)), one.parameters.widths
+        residuals, jacobian, _ = one.both(one.vector())
+        halves, widths = np.zeros((2, one.moments)), one.widths
         return Linear(jacobian, residuals, halves, np.zeros(2), widths, 1000.0)
 
     known = problem(few=True, knowledge=lambda coordinates: 500 * coordinates[1:])
@@ -151,7 +148,7 @@ def test_what_else_is_known_makes_errors_smaller(problem):
 def test_derivatives_are_those_of_wide_differences(problem, fitted):
     """Noise makes readings of a pulse jump; over wide steps of many that is a motion."""
     both = problem(response=fitted)
-    vector = both.parameters.vector()
+    vector = both.vector()
     residuals, jacobian, _ = both.both(vector)
     assert residuals == pytest.approx(both.residuals(vector))
     for i, slope in enumerate(jacobian.T):
@@ -172,12 +169,12 @@ def test_deviations_of_the_readout_are_free_with_the_physics(problem, fitted):
     other = with_settings(fitted, deviations=True)
     other.set_deviation(modes @ np.array([2.0, -1.0]))
     both = problem(response=other, modes=modes)
-    n = both.parameters.n_chain
-    assert both.parameters.vector()[n - 2 : n] == pytest.approx([2.0, -1.0])
+    n = both.n_chain
+    assert both.vector()[n - 2 : n] == pytest.approx([2.0, -1.0])
     (before, _), end = both.compared(), both.fitted()
     assert before > 1.5 * end.chi_square
     errors = np.sqrt(np.linalg.inv(end.information).diagonal()[n - 2 : n])
-    assert np.abs(both.parameters.along / errors).max() < 5
+    assert np.abs(both.along / errors).max() < 5
 
 
 def test_the_fit_finds_chain_and_physics(problem, fitted):
@@ -188,7 +185,7 @@ def test_the_fit_finds_chain_and_physics(problem, fitted):
     assert end.chi_square < 1.2 * both.by_chance[0] + 4 * both.by_chance[1]
     assert before > 2 * end.chi_square
     error = np.sqrt(np.linalg.inv(end.information)[-1, -1])
-    assert abs(both.parameters.coordinates[1]) < 4 * error
+    assert abs(both.coordinates[1]) < 4 * error
 
 
 def test_windows_do_not_jump_where_the_alignment_of_pulses_does(problem, nearby):

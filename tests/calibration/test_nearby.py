@@ -34,9 +34,9 @@ def laid_over(pulses, others):
 
 
 def test_small_changes_are_those_of_a_simulation(simulator):
-    nearby = Nearby.about(simulator, np.zeros(3), range(3))
+    nearby = Nearby.about(simulator, np.zeros(3)).again(range(3))
     there = np.array([0.4, -0.008, 0.3])
-    exact = simulator.exact(there)
+    exact = simulator(there)
     near = nearby.at(there)
     change = laid_over(exact, nearby.base) - nearby.base
     left = laid_over(near, nearby.base) - laid_over(exact, nearby.base)
@@ -46,8 +46,9 @@ def test_small_changes_are_those_of_a_simulation(simulator):
 def test_derivatives_follow_the_edge(simulator):
     """Edges of a warmer detector are later, and self-repulsion smears them there."""
     warmer = np.array([0.5, 0.0, 0.0])
-    fresh = Nearby.about(simulator, warmer, [2])
-    nearby = Nearby.about(simulator, np.zeros(3), [2]).moved(warmer)
+    fresh = Nearby.about(simulator, warmer).again([2])
+    before = Nearby.about(simulator, np.zeros(3)).again([2])
+    nearby = Nearby.about(simulator, warmer, before.derivatives)
     late = nearby.half - nearby.derivatives[2].half
     assert late.max() > 0.3  # samples
     far = np.argmax(late)

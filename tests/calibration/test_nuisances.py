@@ -48,8 +48,10 @@ def test_each_coordinate_reaches_what_it_names():
         coordinates[i] = nuisance.step
         detector, settings = PHYSICS.at(coordinates)
         after = {**detector.model_dump(), **settings.model_dump()}
-        assert after[nuisance.field] > before[nuisance.field]
-        assert {name for name in after if after[name] != before[name]} == {nuisance.field}
+        of_factor = "impurity_scale" if nuisance.name == "impurity_factor" else nuisance.name
+        field = nuisance.field or of_factor
+        assert after[field] > before[field]
+        assert {name for name in after if after[name] != before[name]} == {field}
 
 
 @given(st.sampled_from(NUISANCES), st.floats(0.5, 2.0), st.floats(0.01, 1.0))

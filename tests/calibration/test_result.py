@@ -9,13 +9,15 @@ import pytest
 
 from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
 from cpunet.calibration.identifiability import Linear
-from cpunet.calibration.joint_problem import JointParameters
+from cpunet.calibration.joint_problem import JointProblem
+from cpunet.calibration.nearby import Nearby
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.calibration.result import described
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from synthetic import load_recipe
+from unpaired import DT_NS, charge, coarse
 
 SHORT = ("temperature", "impurity", "cloud", "self_repulsion", "diffusion")
 NUISANCES = tuple(named(name) for name in SHORT)
@@ -24,21 +26,19 @@ PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), NUISANCES)
 
 def calibrated(values=(), degenerate=False) -> CalibratedPhysics:
     """A calibration that ended at these values, in their order; others are as simulated."""
-    response = ElectronicsResponse(load_recipe("fast").matching[0], 16.0)
-    parameters = JointParameters(response, PHYSICS, np.zeros(5), range(5), {}, response)
-    vector = parameters.vector()
+    recipe, at = load_recipe("fast"), np.zeros(5)
+    response = ElectronicsResponse(recipe.matching[0], DT_NS)
+    nearby = Nearby(SimpleNamespace(physics=PHYSICS), at, coarse(charge(9, seed=1)), {})
+    weights = [np.eye(2)]
+    problem = JointProblem(response, nearby, [*range(5)], [], recipe, response, weights=weights)
+    vector = problem.vector()
     for i, value in enumerate(values):
         nominal = PHYSICS.nominal(NUISANCES[i])
-        vector[parameters.n_chain + i] = NUISANCES[i].coordinate(nominal, value)
-    parameters.set(vector)
-    problem = SimpleNamespace(
-        parameters=parameters,
-        nearby=SimpleNamespace(simulator=SimpleNamespace(physics=PHYSICS)),
-        names={"both": ["first", "second"]},
-    )
+        vector[problem.n_chain + i] = NUISANCES[i].coordinate(nominal, value)
+    problem.set(vector)
     covariance = 1e-4 * np.eye(len(vector))
     if degenerate:
-        n, widths = parameters.n_chain, parameters.widths[parameters.n_chain :][:2]
+        n, widths = problem.n_chain, problem.widths[problem.n_chain :][:2]
         shares = np.array([[1, -0.99], [-0.99, 1]])
         covariance[n : n + 2, n : n + 2] = 0.64 * shares * np.outer(widths, widths)
     chi = ChiSquare(

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -86,28 +85,6 @@ def write(
     return write_table(path, table, traces, np.asarray(kev, float), event_number=numbers)
 
 
-@dataclass(frozen=True)
-class Stand:
-    """Files of the stand, and what is in them."""
-
-    folder: Path
-    sim: Path
-    data: Path
-    truth: Path
-    sim_waveforms: npt.NDArray[np.float32]
-    sim_kev: npt.NDArray[np.float64]
-    data_waveforms: npt.NDArray[np.uint16]
-    data_kev: npt.NDArray[np.float64]
-
-    charge, respond = staticmethod(charge), staticmethod(respond)
-    digitised, write = staticmethod(digitised), staticmethod(write)
-
-    @property
-    def inputs(self) -> list[str]:
-        """Options that name the two files."""
-        return ["--sim", str(self.sim), "--data", str(self.data)]
-
-
 @pytest.fixture(scope="session")
 def tiny() -> list[str]:
     """Options that make a training take a second."""
@@ -115,45 +92,47 @@ def tiny() -> list[str]:
 
 
 @pytest.fixture(scope="session")
-def stand(tmp_path_factory: pytest.TempPathFactory) -> Stand:
+def stand(tmp_path_factory: pytest.TempPathFactory) -> SimpleNamespace:
+    """Files of the stand, what is in them, and how they are made."""
     folder = tmp_path_factory.mktemp("stand")
     rng = np.random.default_rng(20)
     sim_kev, data_kev = energies(rng), energies(rng)
-    sim, other = charge(len(sim_kev), rng), charge(len(data_kev), rng)
-    data = digitised(respond(other), data_kev, seed=21)
-    sim32 = sim.astype(np.float32)
-    truth = folder / "truth.npz"
-    np.savez(truth, response=respond(sim).astype(np.float32))
-    return Stand(
+    pulses, other = charge(len(sim_kev), rng), charge(len(data_kev), rng)
+    traces, pulses32 = digitised(respond(other), data_kev, seed=21), pulses.astype(np.float32)
+    sim = write(folder / "sim.lh5", "geds/sim", pulses32, sim_kev, units="")
+    data = write(folder / "data.lh5", "geds/raw", traces, data_kev)
+    np.savez(folder / "truth.npz", response=respond(pulses).astype(np.float32))
+    return SimpleNamespace(
         folder=folder,
-        sim=write(folder / "sim.lh5", "geds/sim", sim32, sim_kev, units=""),
-        data=write(folder / "data.lh5", "geds/raw", data, data_kev),
-        truth=truth,
-        sim_waveforms=sim32,
+        sim=sim,
+        data=data,
+        truth=folder / "truth.npz",
+        inputs=["--sim", str(sim), "--data", str(data)],
+        sim_waveforms=pulses32,
         sim_kev=sim_kev,
-        data_waveforms=data,
+        data_waveforms=traces,
         data_kev=data_kev,
+        charge=charge,
+        respond=respond,
+        digitised=digitised,
+        write=write,
     )
 
 
-Outcome = SimpleNamespace
-Command = Callable[..., Outcome]
-
-
-def call(capsys: pytest.CaptureFixture[str], *words: object) -> Outcome:
-    """Run the command line in this process; its status and what it printed."""
-    capsys.readouterr()
-    status, printed = status_of(*words), capsys.readouterr()
-    return SimpleNamespace(code=status, out=printed.out, err=printed.err)
-
-
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    return lambda *words: call(capsys, *words)
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., SimpleNamespace]:
+    """Run the command line in this process; its status and what it printed."""
+
+    def call(*words: object) -> SimpleNamespace:
+        capsys.readouterr()
+        status, printed = status_of(*words), capsys.readouterr()
+        return SimpleNamespace(code=status, out=printed.out, err=printed.err)
+
+    return call
 
 
 @pytest.fixture(scope="session")
-def trained(stand: Stand, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def trained(stand: SimpleNamespace, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run folder made by the command line; do not change it."""
     out = tmp_path_factory.mktemp("trained") / "run"
     assert status_of("train", *stand.inputs, "--out", out, "--seed", 3, *TINY_OPTIONS) == 0

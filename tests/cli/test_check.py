@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 import shutil
 from collections.abc import Callable
@@ -12,8 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cpunet.pulses.loading import SideInfo
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.validation.validate import validate
 
 N = 240
 FEP = 2614.511
@@ -158,35 +157,14 @@ def test_tails_of_earlier_pulses(sides, check):
     assert "pile-up tails" in done.out
 
 
-class SeenError(Exception):
-    """In place of a minute of scores."""
-
-
-@pytest.mark.thorough
-def test_how_a_file_was_read_is_remembered(stand, trained, tmp_path, monkeypatch):
+def test_how_a_file_was_read_is_remembered(stand, tmp_path):
     """What was said of a file in training holds for the same file in validation."""
-    info = json.loads((trained / "run.json").read_text())
     read_as = {"kev_per_adc": 0.25, "table": "geds/raw"}
-    info["data"] |= {"file": str(stand.data), "read_as": read_as}
-    run = tmp_path / "run"
-    shutil.copytree(trained, run)
-    (run / "run.json").write_text(json.dumps(info))
-    seen: list[PulseFile] = []
-
-    def evaluated(_run: Path, sim: PulseFile, data: PulseFile, **_: object) -> None:
-        seen.extend([sim, data])
-        raise SeenError
-
-    monkeypatch.setattr("cpunet.validation.evaluation.evaluate", evaluated)
-    sim = PulseFile(stand.sim)
+    trained_on = SideInfo(place=str(stand.data.resolve()), read_as=read_as)
     other = Path(shutil.copy(stand.data, tmp_path / "other.lh5"))
     for data, expected in (
         (PulseFile(stand.data), PulseFile(stand.data, "geds/raw", None, 0.25)),
         (PulseFile(stand.data, kev_per_adc=2.0), PulseFile(stand.data, None, None, 2.0)),
         (PulseFile(other), PulseFile(other)),
     ):
-        with pytest.raises(SeenError):
-            validate(run, sim, data, tmp_path / "report")
-        assert seen[-2:] == [sim, expected]
-    assert sim.options == {}
-    assert expected.options == {}
+        assert trained_on.reading(data) == expected

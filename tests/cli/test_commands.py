@@ -208,18 +208,3 @@ def test_no_input_is_replaced(command, home, name, words, out):
     assert outcome.err.count("\n") == 1
     assert "the input" in outcome.err
     assert contents(home) == before
-
-
-@pytest.mark.usefixtures("own_cache")
-def test_units_and_windows_of_a_file(command, tmp_path):
-    path = tmp_path / "hits.csv"
-    columns = "".join(f"#column double {c}\n" for c in ("Event", "X", "Y", "Z", "Edep"))
-    head = "#class tools::wcsv::ntuple\n#title hits\n#separator 44\n"
-    path.write_text(f"{head}{columns}0,1,2,20,1000\n1,1,2,20,400\n2,1,2,220,900\n")
-    words = ["--detector", "ppc", "--set", "grid_mm=0.5", "--hits", path]
-    words += ["--out", tmp_path / "sim.lh5"]
-    assert "names no unit; give " in command("simulate", *words).err
-    units = ["--units", "mm,keV", "--events", "800-1200"]
-    outcome = command("simulate", *words, *units)
-    assert "1 of 2 events written (1 800-1200 by" in outcome.out
-    assert "check --origin, --flip-z and --hits-detector" in outcome.err

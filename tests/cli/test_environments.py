@@ -53,7 +53,8 @@ def test_a_script_without_a_guard_is_named(stand, tmp_path):
 
 def test_a_layer_of_threads_that_is_not_installed_is_replaced():
     """As clusters ask for TBB: https://github.com/numba/numba/issues/6108."""
-    code = "from cpunet.kernels import threads; print(threads())"
+    code = "from cpunet.kernels import start_threads as start; start(); import numba"
+    code += "; print(numba.get_num_threads())"
     said = python("-c", code, NUMBA_THREADING_LAYER="tbb", NUMBA_NUM_THREADS="1")
     assert said.strip() == "1"
 

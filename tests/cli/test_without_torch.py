@@ -64,7 +64,12 @@ def test_what_networks_need_is_named(tmp_path: Path, stand):
 
 
 @pytest.mark.thorough
-def test_the_demo_needs_no_torch(tmp_path: Path):
+def test_a_quick_demo_needs_no_torch_and_says_what_it_is(tmp_path: Path):
     done = without_torch(f"demo --quick --out {tmp_path / 'demo'}")
     assert done.returncode == 0, done.stderr
-    assert (tmp_path / "demo" / "report" / "report.html").exists()
+    report = tmp_path / "demo" / "report"
+    drawn = {path.stem for path in report.glob("*.svg")}
+    assert drawn == {"SEP_mean_pulse", "SEP_current_amplitude", "SEP_single_pulse"}
+    page = (report / "report.html").read_text()
+    assert "This is a quick look" in page
+    assert all(peak in page for peak in ("FEP", "SEP", "DEP"))

@@ -141,8 +141,8 @@ def test_scores_of_pairs_are_those_of_the_windows_without_noise(found):
     each = [translations.without_noise(row) for row in rows]
     windows = {method: np.concatenate([one[method] for one in each]) for method in each[0]}
     assert set(windows) == {"raw", "rc", "rc_late", "gauss_exp", "superpulse", "ren", "truth"}
-    scores = found.metrics.peaks[peak.name].paired
-    squares = pair_squares(windows, windows["truth"], found.run.recipe.scores.edge_samples)
+    scores, edges = found.metrics.peaks[peak.name].paired, found.run.recipe.scores
+    squares = pair_squares(windows, windows["truth"], edges.samples(edges.edge_ns))
     for method, score in scores.items():
         direct = scores_of_squares(squares[method])
         assert vars(score) == pytest.approx(vars(direct), rel=1e-4)

@@ -15,6 +15,7 @@ from cpunet.calibration.calibrated_run import (
     CALIBRATION,
     DETECTOR,
     DPI,
+    MIDDLE,
     SETTINGS,
     SIM,
     Calibration,
@@ -23,14 +24,7 @@ from cpunet.calibration.calibrated_run import (
     figures,
 )
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import (
-    DEPLETION,
-    Freedom,
-    Physics,
-    known_depletion,
-    require_depletion,
-    titled,
-)
+from cpunet.calibration.nuisances import Freedom, Physics, depletion, freedom, titled
 from cpunet.calibration.search import Search
 from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
@@ -59,7 +53,7 @@ from cpunet.training.run import RUN
 log = logging.getLogger(__name__)
 
 # Numbers of pulses per side for which a plan gives the errors.
-PLANNED = (1000, 4000, 40_000)
+PLANNED = ("1000", MIDDLE, "40000")
 # Chi-square per function beyond which the data are of another detector.
 HOPELESS = 50.0
 
@@ -143,10 +137,8 @@ def calibrate(
     settings = load_recipe(recipe)
     _ = settings.matching  # without a chain nothing is calibrated with a detector
     require_seed(seed)
-    freedom = Freedom.of(free, prior)
-    start: Start = partial(
-        _search, recipe=settings, freedom=freedom, peak=peak, events=events, seed=seed
-    )
+    chosen = freedom(free, prior)
+    start = partial(_search, recipe=settings, free=chosen, peak=peak, events=events, seed=seed)
     act: Callable[[str, Pair, Path | None], Calibration | Plan]
     act = partial(_planned, start, force)
     if not plan:
@@ -181,12 +173,14 @@ def _planned(start: Start, force: bool, _name: str, pair: Pair, out: Path | None
         errors[physics.nuisances[i].name] = ExpectedErrors(
             simulated=physics.nominal(physics.nuisances[i]),
             prior=own(width)[1],
-            alone={str(n): own(linear.errors([i], n / 2)[0])[1] for n in PLANNED},
-            all_free={str(n): own(linear.errors(pairs=n / 2)[i])[1] for n in PLANNED},
+            alone={n: own(linear.errors([i], int(n) / 2)[0])[1] for n in PLANNED},
+            all_free={n: own(linear.errors(pairs=int(n) / 2)[i])[1] for n in PLANNED},
         )
-    directions = {str(n): linear.directions(names, n / 2) for n in PLANNED}
-    name = physics.detector.name
-    plan = Plan(detector=name, errors_by_name=errors, directions=directions)
+    plan = Plan(
+        detector=physics.detector.name,
+        errors_by_name=errors,
+        directions={n: linear.directions(names, int(n) / 2) for n in PLANNED},
+    )
     if out is not None:
         plan.save(out, force=force)
     return plan
@@ -206,7 +200,7 @@ def _calibrated(
         with stage("Calibrating", search.simulations) as bar:
             search.simulator.simulated = bar.update
             problem, result = search.run()
-        physics, parameters = search.simulator.physics, problem.parameters
+        physics = search.simulator.physics
         if (per := result.chi_square.after / problem.moments) > HOPELESS:
             raise CpunetError(
                 f"{data.path}: no physics near those of {physics.detector.name} "
@@ -215,7 +209,7 @@ def _calibrated(
             )
         for note in result.notes:
             log.info(titled(note))
-        detector, settings = physics.at(parameters.coordinates)
+        detector, settings = physics.at(problem.coordinates)
         for file, config in ((DETECTOR, detector), (SETTINGS, settings)):
             text = yaml_text(config.model_dump(mode="json"))
             (folder / file).write_text(result.comment + text, encoding="utf-8")
@@ -228,7 +222,7 @@ def _calibrated(
         training = recipe.training.model_copy(update={"drift_terms": 0})
         recipe = recipe.model_copy(update={"training": training})
         job = TrainingJob(recipe, peak, seed, "cpu", sim, data)
-        run = train_chain(job, with_settings(parameters.chain.response, deviations=False))
+        run = train_chain(job, with_settings(problem.response, deviations=False))
         facts = {
             "sim": run.sim.model_copy(update={"file": str(out / SIM)}),
             "started": started.isoformat(timespec="seconds"),
@@ -243,7 +237,7 @@ def _calibrated(
 
 
 def _search(
-    pair: Pair, *, recipe: Recipe, freedom: Freedom, peak: str, events: int, seed: int
+    pair: Pair, *, recipe: Recipe, free: Freedom, peak: str, events: int, seed: int
 ) -> tuple[Search, InputSet]:
     """Read and prepare both sides, of the simulated side some events: search, and the data."""
     selection = parse_selection(peak, recipe.peaks)
@@ -261,20 +255,20 @@ def _search(
             "give more files, or more energies as `peak`",
         )
     recipe = data.recipe.at(data.dt_ns)
-    physics = Physics(stored.detector, stored.settings, freedom.looked_at)
-    require_depletion(physics, freedom.priors)
+    looked_at, chosen, priors = free
+    physics = Physics(stored.detector, stored.settings, looked_at)
+    knowledge = depletion(physics, priors)
     noise, _ = trace_noise(data, recipe.preparation)
     # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
     some, rng = sim.prepared[rows], np.random.default_rng(seed)
+    pulses = some.pulses, data.prepared.pulses
     search = Search(
         simulator=Simulator(stored.hits[some.index], physics),
-        sets=PulseSets(
-            some.pulses, data.prepared.pulses, noise.noise, recipe, rng, noise.tails
-        ),
+        sets=PulseSets(*pulses, noise.noise, recipe, rng, noise.tails),
         recipe=recipe,
-        given={k: v for k, v in freedom.priors.items() if k != DEPLETION},
-        knowledge=known_depletion(physics, freedom.priors.get(DEPLETION)),
-        chosen=freedom.chosen,
+        given=priors,
+        knowledge=knowledge,
+        chosen=chosen,
     )
     return search, data

@@ -32,6 +32,7 @@ DETECTOR, SETTINGS = "detector.yaml", "settings.yaml"
 DPI = 110
 PLAN = FolderKind("plan", "cpunet calibrate --plan", r"plan\.(json|png)")
 _BY_LOAD: Any = {"default": None, "exclude": True, "repr": False}
+MIDDLE = "4000"  # pulses for which a plan shows directions
 SHOWN = 0.25  # least component of a direction that is shown
 
 
@@ -218,6 +219,7 @@ class Calibration(Run):
         The calibrated physics.
     """
 
+    folder: Path = Field(**_BY_LOAD)
     result: CalibratedPhysics = Field(**_BY_LOAD)
 
     @classmethod
@@ -253,27 +255,22 @@ class Calibration(Run):
     @property
     def simulation(self) -> Path:
         """File of all events, simulated again with the calibrated physics."""
-        return self._folder / SIM
+        return self.folder / SIM
 
     @cached_property
     def detector(self) -> Detector:
         """The calibrated detector."""
-        return read_detector(str(self._folder / DETECTOR))
+        return read_detector(str(self.folder / DETECTOR))
 
     @cached_property
     def settings(self) -> SimulationSettings:
         """The calibrated settings of the simulation."""
-        return read_settings(SimulationSettings, self._folder / SETTINGS)
+        return read_settings(SimulationSettings, self.folder / SETTINGS)
 
     @property
     def figures(self) -> dict[str, Figure]:
         """``pulls``, and ``directions`` if any parameter was free."""
         return figures(self.result)
-
-    @property
-    def _folder(self) -> Path:
-        assert self.folder is not None  # a calibration always has a folder
-        return self.folder
 
     def __str__(self) -> str:
         return f"{self.result}\n{self.folder}"
@@ -281,11 +278,8 @@ class Calibration(Run):
     def _repr_html_(self) -> str:
         from cpunet.html_pages import part
 
-        of = self.result.parameters
-        rows = [
-            [titled(name), text, f"{of[name].simulated:.5g}"]
-            for name, text in self.result.shown.items()
-        ]
+        shown, of = self.result.shown, self.result.parameters
+        rows = [[titled(n), text, f"{of[n].simulated:.5g}"] for n, text in shown.items()]
         head, notes = ["physics", "calibrated", "as simulated"], map(titled, self.result.notes)
         return part("object", "", head=head, rows=rows, lines=notes) + super()._repr_html_()
 
@@ -330,7 +324,7 @@ class Plan(InfoPart):
 
     def plot(self) -> Figure:
         """Draw the directions with a middling number of pulses."""
-        return directions_figure(self.directions[self._middle])
+        return directions_figure(self.directions[MIDDLE])
 
     def save(self, folder: str | Path, force: bool = False) -> None:
         """Write ``plan.json`` and ``plan.png``.
@@ -353,19 +347,15 @@ class Plan(InfoPart):
                 rows.append([titled(name), *(f"{error:.3g}" for error in errors)])
             lines.append(text_table([title, "prior", *counts], rows))
         lines.append(
-            f"eigenvectors of the covariance with {self._middle} pulses of each side, error in "
+            f"eigenvectors of the covariance with {MIDDLE} pulses of each side, error in "
             "units of the prior:"
         )
-        for of_axis in self.directions[self._middle]:
+        for of_axis in self.directions[MIDDLE]:
             lines.append(f"{of_axis.error:8.3f}  {titled(of_axis.words, units=False)}")
         return "\n".join(lines)
 
     def __repr__(self) -> str:
         return f"<Plan of {self.detector}: {', '.join(self.errors_by_name)}>"
-
-    @property
-    def _middle(self) -> str:
-        return [*self.directions][len(self.directions) // 2]
 
 
 BEFORE, AFTER = COLOURS["raw"], COLOURS["ren"]

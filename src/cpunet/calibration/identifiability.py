@@ -137,11 +137,10 @@ class Linear:
     def score(self, chosen: Sequence[int]) -> float:
         """Chi-square of each half with chain and these parameters fitted to the other."""
         n, half = self.halves.shape[1], 0.5**0.5  # deviations of a half vary twice as much
-        total = 0.0
+        factor = np.where(np.arange(len(self.residuals)) < n, half, 1.0)
+        jacobian, total = factor[:, np.newaxis] * self.jacobian, 0.0
         for train, test in (self.halves, self.halves[::-1]):
-            rows = np.concatenate([half * train, self.residuals[n:]])
-            factor = np.concatenate([np.full(n, half), np.ones(len(rows) - n)])
-            move = self._move(factor[:, np.newaxis] * self.jacobian, rows, chosen)
+            move = self._move(jacobian, factor * np.r_[train, self.residuals[n:]], chosen)
             left = half * (test + self.jacobian[:n] @ move)
             total += float(left @ left)
         return total
@@ -156,12 +155,11 @@ class Linear:
         """Parameters that the pulses determine, those that held-out pulses need most first."""
         chosen, priors = list[int](), self.widths[self._n_chain :]
         while True:
-            determined = [
-                i
-                for i in range(len(self.coordinates))
-                if i not in chosen and self.errors([*chosen, i])[-1] < DETERMINED * priors[i]
-            ]
-            scores = {i: self.score([*chosen, i]) for i in determined}
+            scores = {
+                i: self.score([*chosen, i])
+                for i, prior in enumerate(priors)
+                if i not in chosen and self.errors([*chosen, i])[-1] < DETERMINED * prior
+            }
             if not scores:
                 return sorted(chosen)
             chosen.append(min(scores, key=lambda i: scores[i]))

@@ -100,6 +100,8 @@ class Simulator:
     ----------
     simulated : callable
         Called after each simulation.
+    finer : int
+        Number of fine samples per sample.
     """
 
     def __init__(self, hits: Hits, physics: Physics) -> None:
@@ -107,28 +109,22 @@ class Simulator:
         self.simulated: Callable[[], None] = lambda: None
         self._hits = hits
         steps = physics.settings.dt_ns / physics.settings.step_ns
-        self._finer = next(n for n in FINER if abs(steps / n - round(steps / n)) < 1e-9)
+        self.finer = next(n for n in FINER if abs(steps / n - round(steps / n)) < 1e-9)
 
-    def exact(self, coordinates: Values) -> FloatArray:
-        """Pulses as `cpunet simulate` produces them, shape (events, samples)."""
+    def __call__(
+        self, coordinates: Values, *, quick: bool = False, most: int | None = None
+    ) -> FloatArray:
+        """Pulses of the first `most` events, shape (events, samples).
+
+        They are those of `cpunet simulate`; if `quick`, they are finely sampled.
+        """
         detector, settings = self.physics.at(coordinates)
-        events = DetectorSimulator(detector, settings).events(self._hits)
+        if quick:
+            settings = settings.model_copy(update={"dt_ns": settings.dt_ns / self.finer})
+        simulator = DetectorSimulator(detector, settings, quick=quick)
+        events = simulator.events(self._hits[:most])
         self.simulated()
         return events.waveforms
-
-    def quick(self, coordinates: Values, most: int | None = None) -> FloatArray:
-        """Finely sampled pulses of the first `most` events, for differences."""
-        detector, settings = self.physics.at(coordinates)
-        fine = settings.model_copy(update={"dt_ns": settings.dt_ns / self._finer})
-        events = DetectorSimulator(detector, fine, quick=True).events(self._hits[:most])
-        self.simulated()
-        return events.waveforms
-
-    def coarse(self, pulses: FloatArray) -> FloatArray:
-        """Average fine samples over the sampling period."""
-        whole = pulses[:, : pulses.shape[1] // self._finer * self._finer]
-        blocks = whole.reshape(len(pulses), -1, self._finer)
-        return np.asarray(blocks.mean(axis=2, dtype=np.float32))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,13 +168,11 @@ class Nearby:
     derivatives: Mapping[int, Derivative]
 
     @classmethod
-    def about(cls, simulator: Simulator, centre: Values, of: Sequence[int]) -> Nearby:
-        """Simulate pulses at a point, and their derivatives in some coordinates."""
-        return cls(simulator, centre, simulator.exact(centre), {}).again(of)
-
-    def moved(self, centre: Values) -> Nearby:
-        """Pulses at another point, with derivatives from the same points as before."""
-        return replace(self, centre=centre, base=self.simulator.exact(centre))
+    def about(
+        cls, simulator: Simulator, centre: Values, derivatives: Mapping[int, Derivative] = {}
+    ) -> Nearby:
+        """Simulate pulses at a point; derivatives may be from other points."""
+        return cls(simulator, centre, simulator(centre), derivatives)
 
     def again(self, of: Sequence[int], most: int | None = None) -> Nearby:
         """The same point, with some derivatives simulated anew for the first `most` events.
@@ -188,11 +182,11 @@ class Nearby:
         if not of:
             return self
         simulator, centre, derivatives = self.simulator, self.centre, {**self.derivatives}
-        physics, here = simulator.physics, simulator.quick(centre, most)
+        here, finer = simulator(centre, quick=True, most=most), simulator.finer
         half = half_maxima(here, np.zeros(len(here)))
         for i in of:
-            nuisance = physics.nuisances[i]
-            low, high = nuisance.bounds(physics.nominal(nuisance))
+            nuisance = simulator.physics.nuisances[i]
+            low, high = nuisance.bounds(simulator.physics.nominal(nuisance))
             ends = [centre[i] - nuisance.step, centre[i] + nuisance.step]
             if ends[0] < low:  # not possible below: upwards only
                 ends = [low, max(low, centre[i]) + 2 * nuisance.step]
@@ -201,8 +195,10 @@ class Nearby:
             for end in ends:
                 moved = centre.copy()
                 moved[i] = end
-                pulses = simulator.quick(moved, most)
-                shapes.append(simulator.coarse(move(pulses, half_maxima(pulses, half) - half)))
+                pulses = simulator(moved, quick=True, most=most)
+                fine = move(pulses, half_maxima(pulses, half) - half)
+                whole = fine[:, : fine.shape[1] // finer * finer].reshape(len(fine), -1, finer)
+                shapes.append(whole.mean(axis=2, dtype=np.float32))
             slope = (shapes[1] - shapes[0]) / np.float32(ends[1] - ends[0])
             derivatives[i] = Derivative(slope, centre, self.half[:most])
         return replace(self, derivatives=derivatives)
@@ -232,16 +228,16 @@ class Nearby:
         Only distances along the coordinates `of` count. Derivatives are out of reach, too, if
         the edges of the pulses have moved.
         """
-
-        def is_known(i: int) -> bool:
-            derivative = self.derivatives.get(i)
-            if derivative is None or len(derivative.pulses) < least:
-                return False
-            near = np.abs(self.centre - derivative.point) <= reach
-            moved = self.half[: len(derivative.half)] - derivative.half
-            return bool(near[list(of)].all() and moved @ moved <= MOVED**2 * len(moved))
-
-        return [i for i in of if not is_known(i)]
+        outdated = []
+        for i in of:
+            known = self.derivatives.get(i)
+            if known is not None and len(known.pulses) >= least:
+                near = np.abs(self.centre - known.point) <= reach
+                moved = self.half[: len(known.half)] - known.half
+                if near[list(of)].all() and moved @ moved <= MOVED**2 * len(moved):
+                    continue
+            outdated.append(i)
+        return outdated
 
     def at(self, coordinates: Values, most: int | None = None) -> FloatArray:
         """Pulses of the first `most` events at some coordinates, shape (events, samples)."""

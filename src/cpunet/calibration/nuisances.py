@@ -6,7 +6,7 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
@@ -52,7 +52,7 @@ class Nuisance:
         Whether it is considered before the others.
     possible
         Range of values that can be true, if narrower than what is allowed.
-    own_field
+    field
         Field of `Detector` or `SimulationSettings`, if not the name.
     """
 
@@ -68,12 +68,7 @@ class Nuisance:
     source: str
     first: bool = False
     possible: tuple[float, float] = (-math.inf, math.inf)
-    own_field: str = ""
-
-    @property
-    def field(self) -> str:
-        """Field of `Detector` or `SimulationSettings`."""
-        return self.own_field or self.name
+    field: str = ""
 
     def value(self, nominal: float, coordinate: float) -> float:
         """Value of the parameter at a coordinate, within the allowed range.
@@ -111,10 +106,6 @@ class Nuisance:
         return self.coordinate(nominal, low), self.coordinate(nominal, self.highest)
 
 
-_MOBILITIES = (
-    "published mobilities differ by 10 to 20 % (Reggiani et al. 1977, Bruyneel et al. 2016)"
-)
-
 # Parameters that are uncertain for any detector come first and are considered first. The others
 # are used only if these do not explain the data.
 NUISANCES = (
@@ -125,7 +116,7 @@ NUISANCES = (
     Nuisance(
         "impurity_factor", "impurity", "factor", "(factor)", 0.1, 0.01, 0.03, 1e-3, 1e3,
         "what a depletion voltage tells of it (Hall probes: 30 %)",
-        first=True, own_field="impurity_scale",
+        first=True,
     ),
     Nuisance(
         "self_repulsion", "self_repulsion", "added", "(factor)", 1.0, 0.3, 0.9, 0, 10,
@@ -143,29 +134,23 @@ NUISANCES = (
         "impurity_tilt_1e10_per_cm4", "tilt", "added", "[10¹⁰/cm⁴]", 0.03, 0.005, 0.02, -10, 10,
         "30 % of a gradient of 1e9 per cm4",
     ),
-    Nuisance(
-        "hole_velocity_low_factor", "hole_velocity_low", "factor", "(factor)",
-        0.1, 0.01, 0.03, 0.25, 4, _MOBILITIES,
+    *(
+        Nuisance(
+            f"{name}_factor", name, "factor", "(factor)", 0.1, step, reach, 0.25, 4,
+            "published mobilities differ by 10 to 20 % (Reggiani et al. 1977, Bruyneel et al. "
+            "2016)",
+        )
+        for name, step, reach in (
+            ("hole_velocity_low", 0.01, 0.03), ("hole_velocity_high", 0.02, 0.05),
+            ("electron_velocity_low", 0.02, 0.1), ("electron_velocity_high", 0.02, 0.1),
+        )
     ),
-    Nuisance(
-        "hole_velocity_high_factor", "hole_velocity_high", "factor", "(factor)",
-        0.1, 0.02, 0.05, 0.25, 4, _MOBILITIES,
-    ),
-    Nuisance(
-        "electron_velocity_low_factor", "electron_velocity_low", "factor", "(factor)",
-        0.1, 0.02, 0.1, 0.25, 4, _MOBILITIES,
-    ),
-    Nuisance(
-        "electron_velocity_high_factor", "electron_velocity_high", "factor", "(factor)",
-        0.1, 0.02, 0.1, 0.25, 4, _MOBILITIES,
-    ),
-    Nuisance(
-        "hole_trapping_per_us", "hole_trapping", "added", "[1/µs]", 0.01, 0.005, 0.03, 0, 10,
-        "0 to 1 % per us",
-    ),
-    Nuisance(
-        "electron_trapping_per_us", "electron_trapping", "added", "[1/µs]",
-        0.01, 0.005, 0.03, 0, 10, "0 to 1 % per us",
+    *(
+        Nuisance(
+            f"{name}_per_us", name, "added", "[1/µs]", 0.01, 0.005, 0.03, 0, 10,
+            "0 to 1 % per us",
+        )
+        for name in ("hole_trapping", "electron_trapping")
     ),
     Nuisance(
         "bias_V", "bias", "added", "[V]", 5.0, 20.0, 60.0, 10, 2e4,
@@ -173,10 +158,9 @@ NUISANCES = (
     ),
     Nuisance(
         "li_thickness_mm", "li_thickness", "added", "[mm]", 0.2, 0.1, 0.3, 0.01, 5,
-        "what a full-charge collection depth is measured to", own_field="li_thickness",
+        "what a full-charge collection depth is measured to", field="li_thickness",
     ),
 )  # fmt: skip
-_NAMES = re.compile(rf"\b({'|'.join(n.name for n in NUISANCES)})\b")
 
 
 def titled(text: str, *, units: bool = True) -> str:
@@ -187,13 +171,10 @@ def titled(text: str, *, units: bool = True) -> str:
     >>> titled("bias_V"), titled("0.94 self_repulsion", units=False)
     ('bias [V]', '0.94 self repulsion')
     """
-
-    def title(match: re.Match[str]) -> str:
-        nuisance = named(match[1])
-        words = nuisance.short.replace("_", " ")
-        return f"{words} {nuisance.unit}" if units else words
-
-    return _NAMES.sub(title, text)
+    for nuisance in NUISANCES:
+        words = nuisance.short.replace("_", " ") + units * f" {nuisance.unit}"
+        text = re.sub(rf"\b{nuisance.name}\b", words, text)
+    return text
 
 
 def named(text: str) -> Nuisance:
@@ -236,8 +217,7 @@ class Physics:
         """Simulated value; 1 for a factor that is not in the settings."""
         if nuisance.name == "impurity_factor":
             return 1.0
-        of_detector = nuisance.field in Detector.model_fields
-        value = getattr(self.detector if of_detector else self.settings, nuisance.field)
+        value = {**dict(self.settings), **dict(self.detector)}[nuisance.field or nuisance.name]
         if value == "siggen":
             return 0.12
         if value == "temperature":
@@ -261,16 +241,12 @@ class Physics:
         """
         of_detector, of_settings = self.detector.model_dump(), self.settings.model_dump()
         values = self.values(coordinates)
-        for nuisance, coordinate in zip(self.nuisances, coordinates, strict=True):
-            if coordinate == 0:
-                continue
-            value = values[nuisance.name]
-            if nuisance.name == "impurity_factor":
-                of_detector["impurity_scale"] *= value
-            elif nuisance.field in of_detector:
-                of_detector[nuisance.field] = value
-            else:
-                of_settings[nuisance.field] = value
+        for n, coordinate in zip(self.nuisances, coordinates, strict=True):
+            if coordinate and n.name == "impurity_factor":
+                of_detector["impurity_scale"] *= values[n.name]
+            elif coordinate:
+                field = n.field or n.name
+                (of_detector if field in of_detector else of_settings)[field] = values[n.name]
         sizes = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
         source = (
             f"detector {self.detector.name}: {sizes} is impossible; narrow a `prior`, "
@@ -311,73 +287,74 @@ DEPLETION = "depletion_voltage"
 _FACTOR, _TILT = 0.1, 0.01
 
 
-@dataclass(frozen=True)
-class Freedom:
-    """The free physical parameters, and prior knowledge of them.
+Freedom: TypeAlias = tuple[tuple[Nuisance, ...], bool, dict[str, tuple[float, float]]]
 
-    Parameters
-    ----------
+
+def freedom(
+    free: str | Sequence[str] = (),
+    prior: Sequence[str] | Mapping[str, tuple[float, float]] = (),
+) -> Freedom:
+    """The free physical parameters, and prior knowledge of them, as users give them.
+
+    Returns
+    -------
     looked_at
         Parameters that can become free.
     chosen
         Whether all of them are free; if not, those that the data constrain.
     priors
         Prior value and error by name, also of ``"depletion_voltage"``.
+
+    Raises
+    ------
+    CpunetError
+        If a parameter is unknown, a prior is not of the form ``NAME=VALUE±ERROR``, its
+        value is not allowed, or it is of a parameter that stays as simulated.
+
+    Examples
+    --------
+    >>> freedom(prior=["temperature=90±0.5"])[2]
+    {'temperature_K': (90.0, 0.5)}
     """
-
-    looked_at: tuple[Nuisance, ...]
-    chosen: bool
-    priors: Mapping[str, tuple[float, float]]
-
-    @classmethod
-    def of(
-        cls,
-        free: str | Sequence[str] = (),
-        prior: Sequence[str] | Mapping[str, tuple[float, float]] = (),
-    ) -> Freedom:
-        """What is free, from names and priors as users give them.
-
-        Raises
-        ------
-        CpunetError
-            If a parameter is unknown, a prior is not of the form ``NAME=VALUE±ERROR``, its
-            value is not allowed, or it is of a parameter that stays as simulated.
-
-        Examples
-        --------
-        >>> Freedom.of(prior=["temperature=90±0.5"]).priors
-        {'temperature_K': (90.0, 0.5)}
-        """
-        texts = [free] if isinstance(free, str) else free
-        parts = [part for text in texts for part in text.split(",") if part.strip()]
-        chosen = tuple(dict.fromkeys(map(named, parts)))
-        # another lithium layer requires new field solutions: only on request
-        looked_at = chosen or tuple(n for n in NUISANCES if n.name != "li_thickness_mm")
-        given = prior.items() if isinstance(prior, Mapping) else map(_split, prior)
-        priors = {}
-        for name, pair in given:
-            value, error = map(float, pair)
-            text = f"`prior` {name}={value:g}"
-            if not (error > 0 and np.isfinite([value, error]).all()):
-                raise CpunetError(f"{text}±{error:g}: expected a value, and an error above 0")
-            nuisance = None if name == DEPLETION else named(name)
-            if nuisance and not nuisance.lowest <= value <= nuisance.highest:
-                limits = f"{nuisance.lowest:g} to {nuisance.highest:g}"
-                raise CpunetError(
-                    f"{text}: {nuisance.name} can be {limits}", "give a value between"
-                )
-            priors[nuisance.name if nuisance else DEPLETION] = value, error
-        without_use = priors.keys() - {DEPLETION, *(n.name for n in looked_at)}
-        if without_use:
+    texts = [free] if isinstance(free, str) else free
+    parts = [part for text in texts for part in text.split(",") if part.strip()]
+    chosen = tuple(dict.fromkeys(map(named, parts)))
+    # another lithium layer requires new field solutions: only on request
+    looked_at = chosen or tuple(n for n in NUISANCES if n.name != "li_thickness_mm")
+    allowed, priors = {n.name for n in looked_at} | {DEPLETION}, {}
+    if isinstance(prior, Mapping):
+        prior = [f"{name}={value}±{error}" for name, (value, error) in prior.items()]
+    for given in prior:
+        try:
+            word, *numbers = re.split("=|±|\\+/?-", given)
+            name, (value, error) = word.strip(), map(float, numbers)
+        except ValueError:
+            remedy = "expected NAME=VALUE±ERROR, as temperature=90±0.5"
+            raise CpunetError(f"`prior` {given}: {remedy}") from None
+        text = f"`prior` {name}={value:g}"
+        if not (error > 0 and np.isfinite([value, error]).all()):
+            raise CpunetError(f"{text}±{error:g}: expected a value, and an error above 0")
+        if name != DEPLETION:
+            nuisance = named(name)
+            name, low, high = nuisance.name, nuisance.lowest, nuisance.highest
+            if not low <= value <= high:
+                limits = f"{low:g} to {high:g}"
+                raise CpunetError(f"{text}: {name} can be {limits}", "give a value between")
+        if name not in allowed:
             raise CpunetError(
-                f"`prior` {min(without_use)}: it stays as simulated",
+                f"`prior` {name}: it stays as simulated",
                 "name it in `free`, or leave out its prior",
             )
-        return cls(looked_at, bool(chosen), priors)
+        priors[name] = value, error
+    return looked_at, bool(chosen), priors
 
 
-def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]) -> None:
-    """Refuse a detector that is not depleted where its physics begin to be varied.
+def depletion(
+    physics: Physics, given: Mapping[str, tuple[float, float]]
+) -> Callable[[Values], Values]:
+    """Deviation of the depletion voltage from its measured value, in units of its error.
+
+    Without a measured value among the priors the function gives no deviation.
 
     Raises
     ------
@@ -387,13 +364,13 @@ def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]
     """
     centres, _ = physics.priors(given)
     higher = np.array([(x.name == "impurity_factor") * x.step for x in physics.nuisances])
-    needed, bias = [], physics.detector.bias_V
+    measured, needed, bias = given.get(DEPLETION), [], physics.detector.bias_V
     for coordinates in (np.zeros(len(centres)), higher, centres):
         detector, _ = physics.at(coordinates)
         scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
         needed.append(solve(detector).depletion_V(scale, tilt) + bias - detector.bias_V)
-    if DEPLETION in given:
-        needed.append(given[DEPLETION][0])
+    if measured is not None:
+        needed.append(measured[0])
     if max(needed) > bias:
         raise CpunetError(
             f"detector {physics.detector.name}: within the priors it depletes at "
@@ -401,20 +378,6 @@ def require_depletion(physics: Physics, given: Mapping[str, tuple[float, float]]
             "correct bias_V or the impurities and simulate again, give a `prior` with which it "
             "depletes, or leave impurity out of `free`",
         )
-
-
-def known_depletion(
-    physics: Physics, measured: tuple[float, float] | None
-) -> Callable[[Values], Values]:
-    """Deviation of the depletion voltage from its measured value, in units of its error.
-
-    Parameters
-    ----------
-    physics
-        Physics to which the coordinates belong.
-    measured
-        Measured voltage and its error in V; None gives no deviation.
-    """
     if measured is None:
         return lambda _: np.empty(0)
     wanted, error = measured
@@ -434,12 +397,3 @@ def known_depletion(
         return np.array([(voltage - wanted) / error])
 
     return deviation
-
-
-def _split(text: str) -> tuple[str, tuple[float, float]]:
-    try:
-        name, value, error = re.split("=|±|\\+/?-", text)
-        return name.strip(), (float(value), float(error))
-    except ValueError:
-        remedy = "expected NAME=VALUE±ERROR, as temperature=90±0.5"
-        raise CpunetError(f"`prior` {text}: {remedy}") from None

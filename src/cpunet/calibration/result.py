@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import chain
 from typing import Any
 
@@ -15,8 +14,8 @@ from cpunet.calibration.calibrated_run import (
     FreeParameter,
 )
 from cpunet.calibration.identifiability import Linear, together
-from cpunet.calibration.joint_problem import JointParameters, JointProblem
-from cpunet.calibration.nuisances import Nuisance, Values
+from cpunet.calibration.joint_problem import JointProblem
+from cpunet.calibration.nuisances import Values
 
 # Number of prior errors beyond which a parameter is reported as unexpected.
 FAR = 3.0
@@ -53,81 +52,58 @@ def described(
     facts
         Further fields of `CalibratedPhysics`.
     """
-    parameters, physics = problem.parameters, problem.nearby.simulator.physics
-    n, nuisances = parameters.n_chain, physics.nuisances
-    centres, priors = physics.priors(parameters.given)
+    physics = problem.physics
+    n, free, fixed, notes = problem.n_chain, {}, {}, []
+    # free parameters: value and error in their own units, and whether these can be true
+    centres, priors = physics.priors(problem.given)
     errors = np.sqrt(covariance.diagonal()[n:])
     # sampling noise makes those with all free larger, too
     errors_all = linear.errors()
-    larger = errors / linear.errors(parameters.free)
-    free, fixed = {}, {}
-    for k, (i, error) in enumerate(zip(parameters.free, errors, strict=True)):
-        name, x = nuisances[i].name, float(parameters.coordinates[i])
-        value, own_error = physics.in_own_unit(i, x, error)
+    larger = errors / linear.errors(problem.free)
+    off = (problem.vector()[n:] - problem.centre[n:]) / problem.widths[n:]
+    ends = np.stack([problem.low, problem.high])[:, n:] == problem.vector()[n:]
+    for k, i in enumerate(problem.free):
+        nuisance, x = physics.nuisances[i], float(problem.coordinates[i])
+        name, (low, high) = nuisance.name, nuisance.possible
+        value, own_error = physics.in_own_unit(i, x, errors[k])
+        doubt = f"{abs(off[k]):.1f} errors of its prior from it" if abs(off[k]) > FAR else None
+        if not low <= value <= high:
+            doubt = f"{low:g} to {high:g} is possible"
+        if ends[:, k].any() and value != 0:  # none of it can be true
+            doubt = "at its bound"
+        if doubt:
+            notes.append(
+                f"the fit uses {name} = {value:.4g} to make up for something else ({doubt}): "
+                "free what else moves pulses so, or give a `prior` if it can be"
+                f"{ADVICE.get(name, '')}"
+            )
         centre, width = physics.in_own_unit(i, float(centres[i]), priors[i])
         free[name] = FreeParameter(
             value=value,
             error=own_error,
             error_all=physics.in_own_unit(i, x, larger[k] * errors_all[i])[1],
-            simulated=physics.nominal(nuisances[i]),
-            doubt=_doubt(parameters, n + k, nuisances[i], value),
+            simulated=physics.nominal(nuisance),
+            doubt=doubt,
             prior=centre,
             prior_error=width,
-            source="given" if name in parameters.given else nuisances[i].source,
+            source="given" if name in problem.given else nuisance.source,
         )
-    here, _ = linear.cost(parameters.free)
-    for i, nuisance in enumerate(nuisances):
-        if i not in parameters.free:
-            more = [*parameters.free, i]
+    # the others: what would be if they were free
+    here, _ = linear.cost(problem.free)
+    for i, nuisance in enumerate(physics.nuisances):
+        if i not in problem.free:
+            more = [*problem.free, i]
             error = chi.errors_scaled_by * linear.errors(more)[-1]
-            value, own_error = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
+            value, own_error = physics.in_own_unit(i, float(problem.coordinates[i]), error)
             fall = here - linear.cost(more)[0]
             fixed[nuisance.name] = FixedParameter(
                 value=value, chi_square_would_fall_by=fall, error_if_free=own_error
             )
-    widths = parameters.widths[n:]
-    off = (parameters.vector()[n:] - parameters.centre[n:]) / widths
-    return CalibratedPhysics(
-        parameters=free,
-        fixed=fixed,
-        together=together(parameters.names, covariance[n:, n:] / np.outer(widths, widths), off),
-        directions=linear.directions([nuisance.name for nuisance in nuisances]),
-        chi_square=chi,
-        covariance=covariance[n:, n:].tolist(),
-        functions=[*chain.from_iterable(problem.names.values())],
-        groups={group: len(names) for group, names in problem.names.items()},
-        notes=_notes(free, fixed, chi),
-        **facts,
-    )
-
-
-def _doubt(parameters: JointParameters, k: int, nuisance: Nuisance, value: float) -> str | None:
-    """Why the value of parameter number `k` is unreliable."""
-    low, high = nuisance.possible
-    x = parameters.vector()[k]
-    off = abs(x - parameters.centre[k]) / parameters.widths[k]
-    if x in (parameters.low[k], parameters.high[k]) and value != 0:  # none of it can be true
-        return "at its bound"
-    if not low <= value <= high:
-        return f"{low:g} to {high:g} is possible"
-    return f"{off:.1f} errors of its prior from it" if off > FAR else None
-
-
-def _notes(
-    free: Mapping[str, FreeParameter], fixed: Mapping[str, FixedParameter], chi: ChiSquare
-) -> list[str]:
-    """Remarks on the result of a calibration."""
-    remarks = [
-        f"the fit uses {name} = {parameter.value:.4g} to make up for something else "
-        f"({parameter.doubt}): free what else moves pulses so, or give a `prior` if it can be"
-        f"{ADVICE.get(name, '')}"
-        for name, parameter in free.items()
-        if parameter.doubt
-    ]
+    # how good the fit is
     per, mean, spread = (x / chi.moments for x in (chi.after, chi.expected, chi.spread))
     if per <= mean + BEYOND_CHANCE * spread:
-        rest = "" if remarks else ": no other physics are needed"
-        text = f"expected from statistics ({mean:.2f} ± {spread:.2f}){rest}"
+        text = f"expected from statistics ({mean:.2f} ± {spread:.2f})"
+        text += "" if notes else ": no other physics are needed"
     else:
         falls = {name: of.chi_square_would_fall_by for name, of in fixed.items()}
         best = max(falls, key=lambda name: falls[name], default="")
@@ -135,4 +111,17 @@ def _notes(
         if best and falls[best] > NOTABLE:
             rest = f"with {best} free, too, it would fall by {falls[best]:.0f}"
         text = f"a poor fit (expected from statistics: {mean:.2f} ± {spread:.2f}); {rest}"
-    return [*remarks, f"chi-square is {per:.2f} per function, {text}"]
+    groups = {group: names for of in problem.functions for group, names in of.names.items()}
+    widths = problem.widths[n:]
+    return CalibratedPhysics(
+        parameters=free,
+        fixed=fixed,
+        together=together([*free], covariance[n:, n:] / np.outer(widths, widths), off),
+        directions=linear.directions([nuisance.name for nuisance in physics.nuisances]),
+        chi_square=chi,
+        covariance=covariance[n:, n:].tolist(),
+        functions=[*chain.from_iterable(groups.values())],
+        groups={group: len(names) for group, names in groups.items()},
+        notes=[*notes, f"chi-square is {per:.2f} per function, {text}"],
+        **facts,
+    )

@@ -18,24 +18,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from cpunet.calibration.joint_problem import JointProblem
 from cpunet.calibration.nuisances import Values
 
 # Largest share of the information along a direction that is taken for noise: the parts of the
 # events do not determine a larger share well enough.
 MOST = 0.9
-
-
-def of_events(problem: JointProblem, scale: float) -> tuple[Values, Values]:
-    """Move of the fitted parameters of a problem, and their covariance; see `of_parts`.
-
-    The errors of the functions are larger by `scale`, those of the priors are not.
-    """
-    vector, functions = problem.parameters.vector(), problem.functions
-    _, jacobian, parts = problem.both(vector)
-    n = sum(len(band.sides) + len(band.sides.data) for band in functions)
-    factor = scale**2 * of_weights(n, problem.by_chance[0], len(vector))
-    return of_parts(jacobian, *parts, factor)
 
 
 def of_parts(

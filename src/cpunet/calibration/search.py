@@ -11,24 +11,24 @@ import copy
 import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
 from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
 from cpunet.calibration.identifiability import Linear
-from cpunet.calibration.joint_problem import JointParameters, JointProblem, events, first
+from cpunet.calibration.joint_problem import JointProblem, events, first
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
 from cpunet.calibration.result import BEYOND_CHANCE, described
-from cpunet.calibration.sampling import of_events
+from cpunet.calibration.sampling import of_parts, of_weights
 from cpunet.calibration.sliced_functions import SlicedJoint
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import POOR, WIDER, Fitter, Parabola, fit_chain
 from cpunet.training.chain_parameters import with_decay, with_settings
-from cpunet.training.comparison import NONE
 from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
 
@@ -82,23 +82,33 @@ class Search:
 
     def __post_init__(self) -> None:
         self._sides = self.sets.sides()
-        several = len(self._sides) > 1
-        self._bands = [name if several else "" for name in self.sets.names]
-        self._functions = self._wide(1.0)
+        self._functions = self._compared(1.0)
         nuisances = self.simulator.physics.nuisances
-        self._all = list(range(len(nuisances)))
+        self._all, self._simulated = list(range(len(nuisances))), np.zeros(len(nuisances))
         self._first = [i for i in self._all if self.chosen or nuisances[i].first]
         dt_ns = self.simulator.physics.settings.dt_ns
-        self._start = ElectronicsResponse(self.recipe.matching.generator, dt_ns)
-        with_decay(self._start, self.sets.tail_slope)
-        self._modes = NONE
+        config, training = self.recipe.matching
+        start = with_decay(ElectronicsResponse(config, dt_ns), self.sets.tail_slope)
+        # the chain alone, with the physics as simulated
+        few = [sides.of(training.search_pulses) for sides in self._sides]
+        self._chain = fit_chain(copy.deepcopy(start), few, Fitter(training)).response
+        # of a chain, pulses near a point, free coordinates, and functions
+        self._problem = partial(
+            JointProblem,
+            recipe=self.recipe,
+            start=start,
+            given=self.given,
+            knowledge=self.knowledge,
+        )
+        # of a usual search: derivatives take two each, of the first parameters, and of all
+        self.simulations = USUAL_ROUNDS + 3 + 2 * (len(self._first) + len(self._all))
 
     def plan(self) -> Linear:
         """What the pulses say of all parameters that may become free, before a fit."""
         few = first(self._functions)
-        nearby = Nearby.about(self.simulator, np.zeros(self._n), [])
+        nearby = Nearby.about(self.simulator, self._simulated)
         nearby = nearby.again(self._all, events(few))
-        return self._looked(self._problem(self._chain(), nearby, self._all, few))
+        return self._looked(self._problem(self._chain, nearby, self._all, few))
 
     def run(self) -> tuple[JointProblem, CalibratedPhysics]:
         """Search until the physics no longer changes: the last comparison, and its result.
@@ -108,29 +118,27 @@ class Search:
         CpunetError
             If pulses cannot be simulated for the detector as given.
         """
-        nearby = Nearby.about(self.simulator, np.zeros(self._n), self._first)
-        response = self._chain()
-        before = self._problem(response, nearby, [], held=True)
+        nearby = Nearby.about(self.simulator, self._simulated).again(self._first)
+        response = self._chain
+        before = self._problem(response, nearby, [], self._functions, held=True)
         chi_square, _ = before.compared()
         self._tell("as simulated", before, chi_square)
-        free = self._first_free(response, nearby)
-        problem, end = self._from_far(response, nearby, free)
+        problem, end = self._from_far(response, nearby)
         if end.chi_square > POOR * problem.moments:  # as if the readout rings
-            self._tell("without deviations", problem, end.chi_square, end)
+            self._tell("without deviations", problem, end.chi_square)
             response = self._deviated(before, chi_square) or response
-            free = self._first_free(response, nearby)
-            problem, end = self._from_far(response, nearby, free)
-        more, last = 0, np.zeros(self._n)
+            problem, end = self._from_far(response, nearby)
+        free, more, last = list(problem.free), 0, self._simulated
         for number in range(1, ROUNDS + 1):
             if number > 1:
-                problem = self._problem(response, nearby, free)
+                problem = self._problem(response, nearby, free, self._functions)
                 end = problem.fitted()
-            self._tell(f"round {number}", problem, end.chi_square, end)
-            response = problem.parameters.chain.response
-            moves = problem.parameters.coordinates - nearby.centre
+            self._tell(f"round {number}", problem, end.chi_square)
+            response = problem.response
+            moves = problem.coordinates - nearby.centre
             settled = (
                 number > 1
-                and bool((np.abs(moves[free]) < SETTLED * _errors(problem, end)).all())
+                and bool((np.abs(moves[free]) < SETTLED * problem.errors).all())
                 and not np.delete(nearby.centre, free).any()
             )
             if settled and not response.config.deviations:
@@ -145,64 +153,39 @@ class Search:
             if better is not None:
                 free, more = better, more + 1
             # all that is not free is as simulated
-            aim = np.where(np.isin(self._all, free), problem.parameters.coordinates, 0.0)
+            aim = np.where(np.isin(self._all, free), problem.coordinates, 0.0)
             last = _relaxed(aim - nearby.centre, last)
             nearby = self._moved(nearby, last, free)
         assert examined is not None
         return self._ended(problem, before, examined, rounds=number, settled=settled)
 
     def _from_far(
-        self, response: ElectronicsResponse, nearby: Nearby, free: Sequence[int]
+        self, response: ElectronicsResponse, nearby: Nearby
     ) -> tuple[JointProblem, Parabola]:
-        """First fit, to some of the pulses, with wider functions first."""
-        at = None
+        """First fit, to some of the pulses, with wider functions first.
+
+        Free are all parameters, if chosen, or those of the first that the pulses determine.
+        """
+        free, at = self._all, nearby.centre
+        if not self.chosen:
+            problem = self._problem(response, nearby, self._first, first(self._functions))
+            free = [self._first[i] for i in self._looked(problem).begin()]
         for wider in (*WIDER, 1.0):
-            functions = first(self._wide(wider))
-            problem = self._problem(response, nearby, free, functions, held=True, at=at)
+            functions = first(self._compared(wider))
+            problem = self._problem(
+                response, nearby, free, functions, held=True, coordinates=at
+            )
             end = problem.fitted()
-            response, at = problem.parameters.chain.response, problem.parameters.coordinates
+            response, at = problem.response, problem.coordinates
         return problem, end
 
-    @property
-    def simulations(self) -> int:
-        """Number of simulations of a usual search, for the remaining time.
-
-        Derivatives take two each: of the first parameters, and of all.
-        """
-        return USUAL_ROUNDS + 3 + 2 * (len(self._first) + self._n)
-
-    @property
-    def _n(self) -> int:
-        return len(self.simulator.physics.nuisances)
-
-    def _chain(self) -> ElectronicsResponse:
-        """Fit of the chain alone, with the physics as simulated."""
-        fitter = Fitter(self.recipe.matching.training)
-        few = [sides.of(fitter.training.search_pulses) for sides in self._sides]
-        return fit_chain(copy.deepcopy(self._start), few, fitter).response
-
-    def _wide(self, wider: float) -> list[SlicedJoint]:
-        both = zip(self._sides, self._bands, strict=True)
-        return [SlicedJoint(sides, wider, band) for sides, band in both]
-
-    def _problem(
-        self,
-        response: ElectronicsResponse,
-        nearby: Nearby,
-        free: Sequence[int],
-        functions: Sequence[SlicedJoint] = (),
-        *,
-        held: bool = False,
-        at: Values | None = None,
-        weights: Sequence[Values] = (),
-    ) -> JointProblem:
-        """Comparison near the point at which pulses were simulated."""
-        response, physics = copy.deepcopy(response), self.simulator.physics
-        at = nearby.centre if at is None else at
-        chain = response, physics, at, free, self.given, self._start
-        parameters = JointParameters(*chain, self._modes)
-        sets = parameters, functions or self._functions, nearby
-        return JointProblem(*sets, self.recipe, self.knowledge, held, weights)
+    def _compared(self, wider: float) -> list[SlicedJoint]:
+        """Functions of each band, with bins wider by a factor."""
+        names = self.sets.names if len(self._sides) > 1 else [""]
+        return [
+            SlicedJoint(sides, wider, name)
+            for sides, name in zip(self._sides, names, strict=True)
+        ]
 
     def _deviated(self, problem: JointProblem, chi_square: float) -> ElectronicsResponse | None:
         """The chain with deviations of its step response, if these physics leave too much.
@@ -213,20 +196,13 @@ class Search:
         mean, spread = problem.by_chance
         if chi_square < mean + BEYOND_CHANCE * spread:
             return None
-        chain = with_settings(problem.parameters.chain.response, deviations=False)
+        chain = with_settings(problem.response, deviations=False)
         sides = [functions.sides for functions in problem.here()]
         deviated = with_deviations(chain, sides, lambda _: None)
         if not deviated.response.config.deviations:
             return None
-        self._modes = deviated.modes
+        self._problem = partial(self._problem, modes=deviated.modes)
         return deviated.response
-
-    def _first_free(self, response: ElectronicsResponse, nearby: Nearby) -> list[int]:
-        """Parameters that are free initially."""
-        if self.chosen:
-            return self._all
-        problem = self._problem(response, nearby, self._first, first(self._functions))
-        return [self._first[i] for i in self._looked(problem).begin()]
 
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
         """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""
@@ -235,7 +211,7 @@ class Search:
         move = np.clip(moved, -farthest, farthest)
         for _ in range(HALVINGS):
             try:
-                place = nearby.moved(nearby.centre + move)
+                place = Nearby.about(self.simulator, nearby.centre + move, nearby.derivatives)
                 break
             except CpunetError as error:  # for example, if the detector is not depleted
                 log.info(f"{error}; going half as far")
@@ -264,45 +240,45 @@ class Search:
 
     def _examined(self, problem: JointProblem) -> Linear:
         """What some of the pulses say of all parameters, also of those that are fixed."""
-        parameters = problem.parameters
-        fixed = [i for i in self._all if i not in parameters.free]
+        fixed = [i for i in self._all if i not in problem.free]
         few = first(self._functions, LOOKED_AT_WITH)
         problem.nearby = problem.nearby.again(problem.nearby.outdated(fixed), events(few))
-        chain, at = parameters.chain.response, parameters.coordinates
-        return self._looked(self._problem(chain, problem.nearby, self._all, few, at=at))
+        every = self._problem(
+            problem.response, problem.nearby, self._all, few, coordinates=problem.coordinates
+        )
+        return self._looked(every)
 
     def _looked(self, problem: JointProblem) -> Linear:
         """What all pulses, and each half of them, tell of the free parameters."""
-        parameters, vector = problem.parameters, problem.parameters.vector()
+        vector = problem.vector()
         residuals, jacobian, _ = problem.both(vector)
-        halves = []
+        half, halves = copy.copy(problem), []
         for k in range(2):
-            half = [functions.some(slice(k, None, 2)) for functions in problem.functions]
-            halves.append(replace(problem, functions=half).residuals(vector))
+            half.functions = [of.some(slice(k, None, 2)) for of in problem.functions]
+            halves.append(half.residuals(vector))
         return Linear(
             jacobian,
             residuals,
             np.array(halves)[:, : problem.moments],
-            parameters.coordinates[parameters.free],
-            parameters.widths,
-            sum(functions.pairs for functions in problem.functions),
+            problem.coordinates[problem.free],
+            problem.widths,
+            # half of the harmonic mean of both sides
+            sum(1 / (1 / len(of.sides) + 1 / len(of.sides.data)) for of in problem.functions),
         )
 
     def _ended(
-        self,
-        problem: JointProblem,
-        before: JointProblem,
-        linear: Linear,
-        **facts: Any,
+        self, problem: JointProblem, before: JointProblem, linear: Linear, **facts: Any
     ) -> tuple[JointProblem, CalibratedPhysics]:
         """The result, without the sampling noise of the simulated events."""
         mean, spread = problem.by_chance
         # errors grow by the root of chi-square over its upper limit by chance (two sigmas)
         scale = float(np.sqrt(max(1.0, problem.compared()[0] / (mean + 2 * spread))))
-        move, covariance = of_events(problem, scale)
-        parameters, physics = problem.parameters, self.simulator.physics
-        moved = np.clip(parameters.vector() + move, parameters.low, parameters.high)
-        parameters.set(moved)
+        vector = problem.vector()
+        _, jacobian, parts = problem.both(vector)
+        n = sum(len(of.sides) + len(of.sides.data) for of in problem.functions)
+        factor = scale**2 * of_weights(n, mean, len(vector))
+        move, covariance = of_parts(jacobian, *parts, factor)
+        problem.set(np.clip(problem.vector() + move, problem.low, problem.high))
         (chi_before, pulls_before), (chi_after, pulls_after) = (
             each.compared() for each in (replace(before, weights=problem.weights), problem)
         )
@@ -314,35 +290,26 @@ class Search:
             spread=spread,
             errors_scaled_by=scale,
         )
-        free, lines = parameters.free, []
+        free = problem.free
         others = [] if self.chosen else [*linear.others(free)]
+        lines = []
         for other in sorted(others, key=lambda other: linear.cost(other)[0])[:MAX_OTHERS]:
             cost, place = linear.cost(other)
             if (rise := cost - linear.cost(free)[0]) < SAME:
-                values = physics.values(place).items()
+                values = self.simulator.physics.values(place).items()
                 sizes = [f"{n} {v:.4g}" for i, (n, v) in enumerate(values) if i in other]
                 lines.append(f"{', '.join(sizes)} (chi-square {rise:+.1f})")
         facts |= {"others": lines, "pulls_before": pulls_before.tolist()}
         facts["pulls_after"] = pulls_after.tolist()
         return problem, described(problem, covariance, chi, linear, **facts)
 
-    def _tell(
-        self, when: str, problem: JointProblem, chi_square: float, end: Parabola | None = None
-    ) -> None:
-        parameters, physics = problem.parameters, self.simulator.physics
+    def _tell(self, when: str, problem: JointProblem, chi_square: float) -> None:
+        physics = self.simulator.physics
         words = [f"{when}: chi-square {chi_square / problem.moments:.2f} per function"]
-        errors = np.empty(0) if end is None else _errors(problem, end)
-        for i, error in zip(parameters.free, errors, strict=True):
-            value, own = physics.in_own_unit(i, float(parameters.coordinates[i]), error)
+        for i, error in zip(problem.free, problem.errors, strict=True):
+            value, own = physics.in_own_unit(i, float(problem.coordinates[i]), error)
             words.append(f"{physics.nuisances[i].name} {value:.4g} ± {own:.2g}")
         log.info(", ".join(words))
-
-
-def _errors(problem: JointProblem, end: Parabola) -> Values:
-    """Standard deviations of the free coordinates."""
-    parameters = problem.parameters
-    covariance = np.linalg.inv(end.information + np.diag(parameters.widths**-2.0))
-    return np.asarray(np.sqrt(covariance.diagonal())[parameters.n_chain :])
 
 
 def _relaxed(moved: Values, last: Values) -> Values:

@@ -17,13 +17,13 @@ from cpunet.training.aligned import Aligned, Floats, Values
 from cpunet.training.comparison import Sides
 from cpunet.training.joint import SEGMENTS, Joint, gaussian_bins
 
-# Bins of the drift time; slices of drift time; components and current amplitude bins in each.
-# For few pulses, half as many.
-DENSITY, SLICES, OTHERS, AMPLITUDES = 24, 8, 6, 8
-FEW = 700
-# Widths in units of the spacing, and minimum widths: twice the effect of noise.
-NARROW, WIDE = 1.0, 0.8
-MIN_DENSITY, MIN_SLICE, MIN_AMPLITUDE = 0.02, 0.05, 0.008
+# Bins of the drift time, its slices, and bins of the current amplitude in each: number (half as
+# many for few pulses), ranks of the first and the last, width in units of the spacing, and
+# minimum width, twice the effect of noise.
+DENSITY = (24, (0.01, 0.99), 1.0, 0.02)
+SLICES = (8, (0.03, 0.97), 0.8, 0.05)
+AMPLITUDES = (8, (0.05, 0.98), 1.0, 0.008)
+OTHERS, FEW = 6, 700  # components in each slice; few pulses
 
 
 class SlicedJoint(Joint):
@@ -41,22 +41,18 @@ class SlicedJoint(Joint):
         super().__init__(sides, wider)
         self.band = band
         drift = self._shape(sides.data)[:, -1]
-        parts = 2 if len(drift) < FEW else 1
-        # the density ends abruptly at the longest drift times
-        self._bands = [
-            (centres, wider * widths)
-            for centres, widths in (
-                _points(drift, DENSITY // parts, (0.01, 0.99), NARROW, MIN_DENSITY),
-                _points(drift, SLICES // parts, (0.03, 0.97), WIDE, MIN_SLICE),
-                _points(
-                    sides.data.log_amplitude,
-                    AMPLITUDES // parts,
-                    (0.05, 0.98),
-                    NARROW,
-                    MIN_AMPLITUDE,
-                ),
-            )
-        ]
+        amplitude, parts = sides.data.log_amplitude, 2 if len(drift) < FEW else 1
+        self._bands = []
+        for values, (n, ranks, factor, least) in (
+            (drift, DENSITY),
+            (drift, SLICES),
+            (amplitude, AMPLITUDES),
+        ):
+            centres = np.quantile(values, np.linspace(*ranks, n // parts))
+            gaps = np.diff(centres)
+            # the density ends abruptly at the longest drift times
+            between = np.concatenate([gaps[:1], np.minimum(gaps[1:], gaps[:-1]), gaps[-1:]])
+            self._bands.append((centres, wider * np.maximum(factor * between, least)))
 
     @property
     def names(self) -> dict[str, list[str]]:
@@ -64,32 +60,25 @@ class SlicedJoint(Joint):
         times, n = np.array_split(self.sides.time_ns, SEGMENTS), self.matrix.shape[1] - SEGMENTS
         components = [f"component {i}" for i in range(n, 0, -1)]
         bins = [f"current amplitude, bin {k + 1}" for k in range(len(self.places))]
+        products = [f"{c}, {bin_}" for bin_ in bins if self.products for c in components]
         density, slices, amplitudes = (range(1, len(c) + 1) for c, _ in self._bands)
-        others = range(2, OTHERS + 2)
+        sliced = [f"component {c}" for c in range(2, OTHERS + 2)]
+        several = [f"current amplitude, bin {j}" for j in amplitudes]
         groups = {
             "samples": [f"samples about {t[len(t) // 2]:.0f} ns" for t in times],
             "components": components,
             "current amplitude": bins,
-            "components with current amplitude": [
-                f"{component}, {bin_}" for bin_ in bins for component in components
-            ],
+            "components with current amplitude": products,
             "drift time": [f"drift time, bin {k}" for k in density],
-            "components in slices": [
-                f"component {c}, slice {k}" for c in others for k in slices
-            ],
-            "current amplitude in slices": [
-                f"current amplitude, bin {j}, slice {k}" for j in amplitudes for k in slices
-            ],
+            "components in slices": [f"{c}, slice {k}" for c in sliced for k in slices],
+            "current amplitude in slices": [f"{b}, slice {k}" for b in several for k in slices],
         }
-        if not self.products:
-            del groups["components with current amplitude"]
         band = f"{self.band}: " if self.band else ""
-        return {f"{band}{of}": [f"{band}{name}" for name in own] for of, own in groups.items()}
-
-    @property
-    def pairs(self) -> float:
-        """Number of pulses that errors refer to: half of the harmonic mean of both sides."""
-        return 1 / (1 / len(self.sides) + 1 / len(self.sides.data))
+        return {
+            f"{band}{of}": [f"{band}{name}" for name in own]
+            for of, own in groups.items()
+            if own
+        }
 
     def _functions(self, pulses: Aligned) -> Values:
         shape = self._shape(pulses)
@@ -121,13 +110,3 @@ class SlicedJoint(Joint):
         drift = shape[:, -1]
         own = (drift, drift, pulses.log_amplitude)
         return [gaussian_bins(of, *band) for of, band in zip(own, self._bands, strict=True)]
-
-
-def _points(
-    values: Values, n: int, range_: tuple[float, float], factor: float, least: float
-) -> tuple[Values, Values]:
-    """Equally populated centres, and a width for each."""
-    centres = np.quantile(values, np.linspace(*range_, n))
-    gaps = np.diff(centres)
-    between = np.concatenate([gaps[:1], np.minimum(gaps[1:], gaps[:-1]), gaps[-1:]])
-    return centres, np.maximum(factor * between, least)

@@ -21,7 +21,7 @@ from cpunet.pulses.provenance import MADE_BY, SIDE, SIMULATION
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.settings import Set, checked, read_json, require_seed, words_and_files
+from cpunet.settings import Set, checked, key_values, read_json, require_seed
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
 from cpunet.simulation.hit_sources import GammaSource, wanted_events
@@ -173,7 +173,7 @@ def make_stand(
     words = [w for given in (shift, settings) if not isinstance(given, Mapping) for w in given]
     given = (electronics, detector, *words)
     refuse_inputs(Path(out), *(f for f in given if isinstance(f, str | Path)))
-    values = words_and_files(settings)
+    values = key_values(settings, files=True)
     readout = Electronics.model_fields.keys() - {"name"}  # a name is that of the detector
     of_chain = {k: values.pop(k) for k in [*values] if k.split(".")[0] in readout}
     seed, moved = require_seed(seed), Shift.of(shift)

@@ -89,10 +89,11 @@ class LinearInverse(Stored):
 
     def __init__(self, length: int, config: MatchingConfig) -> None:
         self.length = length
-        self.before, stop = config.baseline
-        self.after = min(config.samples(AFTER_NS), config.after)
+        after = config.samples(config.after_ns)
+        self.before, stop = map(config.samples, config.baseline_ns)
+        self.after = min(config.samples(AFTER_NS), after)
         self.baseline = (-self.before, -stop)
-        self.level = (config.after - config.level_samples, config.after)
+        self.level = (after - config.samples(config.level_ns), after)
         n = self.before + self.after
         self.half_height = np.array(0.0)  # half of the maximum, the same for all windows
         self.mean_in, self.mean_out, self.weights = np.zeros(n), np.zeros(n), np.zeros((n, n))

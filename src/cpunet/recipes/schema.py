@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, model_validator
 
 from cpunet.errors import CpunetError
 from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples, Width
@@ -85,13 +85,6 @@ class ResponseConfig(Config):
     drift_terms: DriftTerms
     deviations: bool
     by_height: bool
-
-    @field_validator("slow_ns", "fast_decays_us")
-    @classmethod
-    def _times_differ(cls, times: tuple[float, ...]) -> tuple[float, ...]:
-        if len({*times}) < len(times):
-            raise ValueError("times must differ")
-        return times
 
 
 class GruConfig(Config):
@@ -230,12 +223,6 @@ class LossConfig(Timed):
     identity_weight: NonNegative
     adversarial_weight: NonNegative
 
-    @property
-    def edges(self) -> tuple[int, int]:
-        """Samples at which the baseline and the rising edge end."""
-        end_ns = self.baseline_ns + self.rising_edge_ns
-        return self.samples(self.baseline_ns), self.samples(end_ns)
-
 
 class TrainingConfig(Timed):
     """Settings of the game of generators and critics, see `cpunet.training.adversarial`.
@@ -303,27 +290,6 @@ class MatchingConfig(Timed):
     start_factors: Annotated[tuple[Positive, ...], Field(min_length=1, max_length=100)]
     drift_terms: DriftTerms
 
-    @property
-    def before(self) -> int:
-        """Samples that are compared before the half maximum."""
-        return self.samples(self.before_ns)
-
-    @property
-    def after(self) -> int:
-        """Samples that are compared from the half maximum on."""
-        return self.samples(self.after_ns)
-
-    @property
-    def baseline(self) -> tuple[int, int]:
-        """Samples before the half maximum between which the mean becomes 0."""
-        first, stop = self.baseline_ns
-        return self.samples(first), self.samples(stop)
-
-    @property
-    def level_samples(self) -> int:
-        """Samples whose mean becomes the level."""
-        return self.samples(self.level_ns)
-
     @model_validator(mode="after")
     def _stretches_fit(self) -> MatchingConfig:
         if not self.baseline_ns[0] > self.baseline_ns[1]:
@@ -347,11 +313,6 @@ class ScoreConfig(Timed):
     edge_ns: Positive
     sideband_kev: _RangeKev
     continuum_kev: dict[str, _RangeKev]
-
-    @property
-    def edge_samples(self) -> int:
-        """Samples on either side of the half maximum that are its edge."""
-        return self.samples(self.edge_ns)
 
 
 Critics = Annotated[GruConfig | ConvolutionalConfig, Field(discriminator="name")]

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import Field, field_validator, model_validator
 
-from cpunet.settings import C, Config, Set, checked, words_and_files
+from cpunet.settings import C, Config, Set, checked, key_values
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 
@@ -174,7 +174,7 @@ def detector_and_settings(
     >>> detector.bias_V, settings.hole_trapping_per_us
     (3500.0, 0.01)
     """
-    values = words_and_files(overrides)
+    values = key_values(overrides, files=True)
     own = {key: values.pop(key) for key in [*values] if key in SimulationSettings.model_fields}
     settings = checked(SimulationSettings, defaults | own, "settings")
     return read_detector(detector, values), settings
@@ -240,7 +240,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
         >>> Shift.of(["temperature_K=2", "self_repulsion=0.5"]).self_repulsion
         0.5
         """
-        return checked(cls, words_and_files(parts, _SHIFTS), "shift")
+        return checked(cls, key_values(parts, files=True, folder=_SHIFTS), "shift")
 
     def applied(self, to: C) -> C:
         """Shifted version of a detector or of simulation settings.

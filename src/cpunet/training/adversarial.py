@@ -113,7 +113,8 @@ class Critic(nn.Module):
 
 def window_weights(config: schema.LossConfig, length: int) -> Tensor:
     """Weight of each sample in the L1 losses: baseline, edge and tail count by their means."""
-    begin, end = config.edges
+    begin = config.samples(config.baseline_ns)
+    end = config.samples(config.baseline_ns + config.rising_edge_ns)
     each = config.baseline_weight, config.rising_edge_weight, config.tail_weight
     lengths = begin, end - begin, length - end
     return torch.cat([torch.full((n,), w / n) for n, w in zip(lengths, each, strict=True)])

@@ -52,7 +52,7 @@ class Frame:
     @classmethod
     def of(cls, config: MatchingConfig) -> Frame:
         """The frame of a recipe at its sampling period."""
-        after = config.after - 2  # the cubic needs two more samples
+        after = config.samples(config.after_ns) - 2  # the cubic needs two more samples
         first, last = (-config.samples(ns) for ns in config.baseline_ns)
         level = after - config.samples(config.level_ns), after
         taps, dt_ns = current_amplitude_kernel(config.sampled_ns), config.sampled_ns

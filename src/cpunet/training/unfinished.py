@@ -15,7 +15,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from types import FrameType
@@ -25,14 +25,13 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import (
+    MARKER,
     FolderKind,
     Given,
     mark,
     not_written,
     refuse_existing,
     refuse_inputs,
-    remove_own,
-    require_kind,
     require_replaceable,
 )
 from cpunet.settings import flat
@@ -78,7 +77,7 @@ def unfinished_folder(
     require_replaceable(out, RUN)
     folder = out.parent / f"{out.name}.unfinished"
     refuse_inputs(folder, *inputs)
-    require_kind(folder, UNFINISHED)
+    require_replaceable(folder, UNFINISHED)
     checkpoint = folder / CHECKPOINT
     if checkpoint.exists() and not (resume or force):
         raise CpunetError(
@@ -87,7 +86,7 @@ def unfinished_folder(
         )
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        mark(folder, UNFINISHED, listed=False)
+        mark(folder, UNFINISHED)
     except OSError as error:
         raise not_written(error, folder, folder) from error
     try:
@@ -95,7 +94,10 @@ def unfinished_folder(
         checkpoint.unlink(missing_ok=True)
     finally:
         if not checkpoint.exists():
-            remove_own(folder, UNFINISHED)
+            for name in (ASIDE, MARKER):
+                (folder / name).unlink(missing_ok=True)
+            with suppress(OSError):  # somebody's files are in it
+                folder.rmdir()
 
 
 class UnfinishedRun:

@@ -301,8 +301,8 @@ def translate_all(
             )
             if responses is not None:
                 truth.append(clean.pop("truth"))
-                edge_samples = recipe.scores.edge_samples
-                for name, of_block in pair_squares(clean, truth[-1], edge_samples).items():
+                edge = recipe.scores.samples(recipe.scores.edge_ns)
+                for name, of_block in pair_squares(clean, truth[-1], edge).items():
                     squares[name].append(of_block)
             bar.update(len(block))
     measured = data.prepared.pulses
