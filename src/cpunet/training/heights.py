@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -24,12 +25,25 @@ from cpunet.training.chain_parameters import SmoothParameters, with_settings
 from cpunet.training.comparison import Sides
 from cpunet.training.deviations import SHARED, Linearised, posterior
 
-# Stages: most pulses of a side, width of the bounded functions, least error of a quantile
-# (those of a limited current are all but equal), share by which a step must lower the cost.
-STAGES = ((512, 60.0, 3e-3, 0.03), (512, 6.0, 1e-3, 0.03), (1024, 1.5, 2e-4, 0.003))
+
+class Stage(NamedTuple):
+    """Pulses of a side, width of the bounded functions, least error of a quantile, and gain.
+
+    Quantiles of a limited current are all but equal.  A stage ends with a step that lowers the
+    cost by less than the share `gain`.
+    """
+
+    most: int
+    width: float
+    least: float
+    gain: float
+
+
+FIRST = (Stage(512, 60.0, 3e-3, 0.03), Stage(512, 6.0, 1e-3, 0.03))
+LAST = Stage(1024, 1.5, 2e-4, 0.003)
 MOST = 2048  # pulses that are fitted, and as many that are held out
 LIMITS = (2.0, 1.4, 1.1, 0.9, 0.75, 0.6, 0.5)  # of a slew rate to begin with, in largest steps
-STEPS, FIRST, TRIES = 10, 1e-3, 5  # of a stage; damping, and tries
+STEPS, DAMPING, TRIES = 10, 1e-3, 5  # of a stage; damping at first, and tries
 WELL = 1.5  # chi-square per function, with which no slew rate is searched for
 GAIN = 20.0  # in chi-square of pulses that were held out
 # Priors: variances of the follower's logarithm per largest step, widths of the curve in parts
@@ -99,23 +113,22 @@ def with_heights(
     behind = [sides.entering(own) for sides in bands]
     halves = [min(len(sides), len(sides.data), 2 * MOST) // 2 for sides in bands]
     fitted = [sides.of(n) for sides, n in zip(behind, halves, strict=True)]
-    *first, (most, *last) = STAGES
     for limited in False, True:
         if limited:
-            _limit(own, [sides.of(first[0][0]) for sides in fitted])
-        for few, *stage in first:
-            _solve(own, [sides.of(few) for sides in fitted], *stage, count)
+            _limit(own, [sides.of(FIRST[0].most) for sides in fitted])
+        for stage in FIRST:
+            _solve(own, [sides.of(stage.most) for sides in fitted], stage, count)
         near, functions = chi_square(own, fitted)
         if near < WELL * functions:
             break  # a slew rate would make up for what is a curve
-    _solve(own, [sides.of(most) for sides in fitted], *last, count)
+    _solve(own, [sides.of(LAST.most) for sides in fitted], LAST, count)
     held = [sides.some(slice(n, 2 * n)) for sides, n in zip(bands, halves, strict=True)]
     (before, _), (after, functions) = chi_square(response, held), chi_square(own, held)
     line = f"chi-square of held-out pulses {before:.0f} → {after:.0f}"
     if before - after <= GAIN:
         return None, f"left out; {line}"
     whole = [sides.of(2 * MOST) for sides in behind]
-    covariance = _solve(own, whole, *last, count)
+    covariance = _solve(own, whole, LAST, count)
     return Fitted(own, after, round(functions), covariance), f"used; {line}"
 
 
@@ -160,16 +173,14 @@ def _limit(own: ElectronicsResponse, bands: Sequence[Sides]) -> None:
     by_height.curve[:] = 0
     for rate in rates:
         by_height.lag[1:] = rate
-        costs.append(chi_square(own, bands, STAGES[0][1])[0])
+        costs.append(chi_square(own, bands, FIRST[0].width)[0])
     by_height.lag[1:] = rates[int(np.argmin(costs))]
 
 
 def _solve(
     own: ElectronicsResponse,
     bands: Sequence[Sides],
-    width: float,
-    least: float,
-    share: float,
+    stage: Stage,
     count: Callable[[float], None],
 ) -> Values:
     """Set chain, follower and curve to their minimum of chi-square with priors.
@@ -178,9 +189,9 @@ def _solve(
     """
     unknowns, padded = Unknowns(own), bands[0].padded
     bounds = unknowns.bounds
-    best, damping, last = (LAGS[-1], CURVES[-1]), FIRST, width == STAGES[-1][1]
+    best, damping = (LAGS[-1], CURVES[-1]), DAMPING
     precision = np.linalg.inv(unknowns.covariance(*best))
-    problem = Linearised(bands, partial(Moves, unknowns), width, least)
+    problem = Linearised(bands, partial(Moves, unknowns), stage.width, stage.least)
 
     def cost_at(place: Values, anew: bool = False) -> float:
         unknowns.put(place)
@@ -194,7 +205,7 @@ def _solve(
         place = unknowns.place
         cost = cost_at(place, anew=True)
         right = problem.right
-        if last:  # near enough that the evidence says how much of each is needed
+        if stage is LAST:  # near enough that the evidence says how much of each is needed
             start, evidence = right - problem.information @ unknowns.centre, {}
             for choice in product(LAGS, CURVES):
                 prior = unknowns.covariance(*choice)
@@ -217,7 +228,7 @@ def _solve(
             unknowns.put(place)
             break
         unknowns.place, damping = tried, 0.1 * damping
-        if cost - new < share * cost:
+        if cost - new < stage.gain * cost:
             break
     if best[0] == LAGS[0]:
         unknowns.by_height.lag[:] = 0

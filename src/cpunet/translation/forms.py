@@ -120,7 +120,7 @@ class Form:
             record = self.n_pre, self.length
             if self.scale is None:
                 record = padding(dt_ns)[0] + self.n_pre, record_length(self.length, dt_ns)
-            sizes = learned.law.energies_kev
+            sizes = learned.energies_kev
             piled = InTracePileUp.draw(n, rate_khz, sizes, dt_ns, *record, generator)
             truth |= piled.columns()
         windows = self.scale is None
