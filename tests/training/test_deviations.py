@@ -14,10 +14,11 @@ from cpunet.networks.response_layer import (
     late_lags,
     padding,
 )
+from cpunet.training.aligned import Basis
+from cpunet.training.bands import Sides
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
-from cpunet.training.comparison import Comparison, Sides
-from cpunet.training.derivatives import Basis
+from cpunet.training.comparison import Comparison
 from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.verdict import PARTS, Verdict, verdict

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from cpunet.training.aligned import Aligned, Floats, Values
-from cpunet.training.comparison import Sides
+from cpunet.training.bands import Sides
 from cpunet.training.joint import SEGMENTS, Joint, gaussian_bins
 
 # Bins of the drift time; slices of drift time; components and current amplitude bins in each.

@@ -26,8 +26,9 @@ from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.aligned import Values
+from cpunet.training.bands import Sides
 from cpunet.training.chain_parameters import SmoothParameters
-from cpunet.training.comparison import Comparison, Difference, Sides
+from cpunet.training.comparison import Comparison, Difference
 from cpunet.training.joint import Joint, SingleSites
 
 WIDER = (16.0, 4.0)  # functions with which the valley is searched

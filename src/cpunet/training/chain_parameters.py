@@ -12,8 +12,7 @@ import scipy.fft
 
 from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, deviation_lags
 from cpunet.pulses.container import FloatArray
-from cpunet.training.aligned import Values
-from cpunet.training.derivatives import Basis
+from cpunet.training.aligned import Basis, Values
 
 POLES, DECAY, DECAY_WEIGHTS = "log_poles_ns", "log_decay_us", "decay_weights"
 # Widths of the priors around the start: wide for times (in their logarithm).

@@ -31,11 +31,16 @@ import scipy.linalg
 from scipy.interpolate import CubicSpline
 from scipy.special import expit
 
-from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, deviation_lags
-from cpunet.training.aligned import Values
+from cpunet.networks.response_layer import (
+    DRAWS,
+    ElectronicsResponse,
+    Spectrum,
+    deviation_lags,
+)
+from cpunet.training.aligned import Basis, Values
+from cpunet.training.bands import Sides
 from cpunet.training.chain_parameters import SmoothParameters, with_settings
-from cpunet.training.comparison import MOST, NONE, Comparison, Moved, Sides, Spectrum
-from cpunet.training.derivatives import Basis
+from cpunet.training.comparison import MOST, NONE, Comparison, Moved
 from cpunet.training.joint import Joint
 
 # Knots in ns: the last of the dense ones and of all, and their spacing.

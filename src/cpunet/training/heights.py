@@ -19,9 +19,9 @@ import scipy.linalg
 from cpunet.networks.by_height import CURVE_KNOTS, LAG_KNOTS, PER_STEP
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.aligned import Aligned, Floats, Values
+from cpunet.training.bands import Sides
 from cpunet.training.chain_fit import Fitted, Parabola, bounded_step, chi_square
 from cpunet.training.chain_parameters import SmoothParameters, with_settings
-from cpunet.training.comparison import Sides
 from cpunet.training.deviations import SHARED, Linearised, posterior
 
 # Stages: most pulses of a side, width of the bounded functions, and least error of a quantile,

@@ -24,13 +24,13 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 
+from cpunet.networks.response_layer import Spectrum
 from cpunet.pulses.container import FloatArray
-from cpunet.training.aligned import Aligned, Floats, Samples, Values
-from cpunet.training.comparison import Difference, Sides, Spectrum
-from cpunet.training.derivatives import Basis, Changes, Derivatives
+from cpunet.training.aligned import Aligned, Basis, Changes, Derivatives, Floats, Values
+from cpunet.training.bands import Sides
+from cpunet.training.comparison import Difference
 
 COMPONENTS, SEGMENTS, BINS = 24, 20, 16
 CLIPPED = 4.0  # robust standard deviations at which components and segments are clipped
@@ -97,15 +97,13 @@ class Joint:
 
     def taking(self, sim: FloatArray) -> Self:
         """The same with other simulated pulses of the same events."""
-        return self.with_sides(self.sides.taking(sim))
-
-    def of_events(self, rows: slice | Samples | npt.NDArray[np.bool_]) -> Self:
-        """The same of some of the simulated pulses, and all measured ones."""
-        return self.with_sides(self.sides.of_events(rows))
+        sides = copy.copy(self.sides)
+        sides.take(sim)
+        return self.with_sides(sides)
 
     def some(self, rows: slice) -> Self:
         """The same functions of some pulses of both sides."""
-        other = self.of_events(rows)
+        other = self.with_sides(self.sides.of_events(rows))
         other.sides.data, other.data = self.sides.data[rows], self.data[rows]
         return other
 

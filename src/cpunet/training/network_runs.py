@@ -81,18 +81,17 @@ def train_networks(job: TrainingJob) -> Run:
 
     game, run = _played(job, recipe, partial(generators, recipe, float(decay)), noise)
     parts: dict[str, Any] = {}
-    for part, side in (("ren", "sim"), ("iren", "data")):
-        network = game.averaged(part)
+    for part, side in (("ren", game.sides.sim), ("iren", game.sides.data)):
+        network = game.average[part]
         if network.linear is None:
-            settle(network, getattr(game.sides, side), game.config)
+            settle(network, side, game.config)
         parts[part] = network.unet if network.linear is None else network
     parts |= {f"discriminator_{side}": critic for side, critic in game.critics.items()}
     if noise is not None:
         parts["noise"] = KeptNoise(noise.dt_ns)
         parts["noise"].set_noise(noise.noise)
-    more: dict[str, Any] = {"resumed_at": run.resumed_at} if run.resumed_at else {}
-    if info is not None:
-        more["fit"] = info
+    more: dict[str, Any] = {"resumed_at": run.resumed_at, "fit": info}
+    more = {name: value for name, value in more.items() if value}
     return job.run(parts, recipe, run.started, run.seconds, run.records, **more)
 
 
@@ -198,7 +197,7 @@ def learned_residuals(
         ("iren", _iren_scale(game)),
     ):
         gains[f"U-Net of {name.upper()}"] = line
-        residual = game.averaged(name).unet
+        residual = game.average[name].unet
         if scale and isinstance(residual, Residual):
             with torch.no_grad():
                 for values in residual.unet.outlet.parameters():
@@ -230,12 +229,11 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> tuple[fl
     """Scale of REN's U-Net with which a classifier of held-out pulses is least right."""
     sim, data, preparation = game.sides.sim, game.sides.data, recipe.preparation
     charge, real = (side.pulses[side.seen :][:MOST].cpu().numpy() for side in (sim, data))
-    residual = game.averaged("ren").unet
+    residual = game.average["ren"].unet
     assert isinstance(residual, Residual)
-    records = chain.response(charge)
+    records, results = chain.response(charge), list[TwoSample]()
     change = applied(residual)(records)
-
-    def judged(scale: float) -> TwoSample:
+    for scale in SCALES:
         windows = finish(
             records + np.float32(scale) * change,
             preparation,
@@ -246,9 +244,8 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> tuple[fl
         windows = windows[np.isfinite(windows).all(axis=1)]
         pair = (Pulses.of(pulses, dt_ns=preparation.sampled_ns) for pulses in (real, windows))
         values = [pulse_parameters(pulses, preparation, recipe.scores) for pulses in pair]
-        return classifier_auc(real, windows, seed=0, features=(values[0], values[1]))
-
-    results = [judged(scale) for scale in SCALES]
+        features = values[0], values[1]
+        results.append(classifier_auc(real, windows, seed=0, features=features))
     best = int(np.argmin([result.auc for result in results]))
     text = f"AUC of held-out pulses {results[0].auc:.3f} → {results[-1].auc:.3f}"
     error = results[0].auc_std
@@ -258,9 +255,8 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> tuple[fl
 @torch.no_grad()
 def _iren_scale(game: Game) -> tuple[float, str]:
     """Scale of IREN's U-Net with which held-out cycles end closest to where they began."""
-    sides, (ren, iren) = game.sides, (game.averaged(part) for part in ("ren", "iren"))
-    assert ren.linear is not None
-    assert iren.linear is not None
+    sides, pair = game.sides, dict[str, Any](game.average.items())
+    ren, iren = pair["ren"], pair["iren"]
     rows = torch.arange(sides.sim.seen, len(sides.sim.pulses))[:MOST]
     with torch.random.fork_rng():
         torch.manual_seed(0)

@@ -22,8 +22,8 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.aligned import Frame, Samples, Values
-from cpunet.training.comparison import MOST, Sides
-from cpunet.training.drawn_noise import Noise
+from cpunet.training.bands import Noise, Sides
+from cpunet.training.comparison import MOST
 
 # Ratio of the limits of a band; the next is used only if no band of the previous is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)

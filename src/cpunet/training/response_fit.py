@@ -21,9 +21,10 @@ from typing import NamedTuple
 import numpy as np
 
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.bands import Sides
 from cpunet.training.chain_fit import Fitted, Fitter, chi_square, fit_chain
 from cpunet.training.chain_parameters import Parameters, with_decay, with_settings
-from cpunet.training.comparison import AMPLITUDE, Comparison, Difference, Sides
+from cpunet.training.comparison import AMPLITUDE, Comparison, Difference
 from cpunet.training.deviations import with_deviations
 from cpunet.training.diagnosis import DRIFT, stretched
 from cpunet.training.heights import with_heights
