@@ -27,8 +27,7 @@ from cpunet.training.adversarial import (
     window_weights,
 )
 from cpunet.training.network_runs import settle
-from cpunet.training.sides import RECENT, Judge
-from cpunet.training.views import View, aligned, nominal
+from cpunet.training.views import RECENT, Judge, View, aligned, nominal
 from games import as_published, game_of, mended, windows
 from synthetic import LOSS_NAMES, interrupted_in, load_recipe
 

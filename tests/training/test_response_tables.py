@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from cpunet.networks.generators import ResponseGenerator
-from cpunet.training.chain_parameters import Parameters
+from cpunet.training.chain_parameters import by_name, vector_of
 from cpunet.training.response import response
 from synthetic import write_chain
 
@@ -24,10 +24,9 @@ def chain(folder: Path, pole_ns: float) -> Path:
 
     def change(generator: ResponseGenerator) -> None:
         generator.response.log_poles_ns[:] = np.log([45.0, pole_ns])
-        parameters = Parameters(generator.response)
-        error = np.full(len(parameters.centre), 1e-4)
+        error = np.full(len(vector_of(generator.response)), 1e-4)
         covariance = np.diag(error**2).tolist()
-        facts["fit"] = {"errors": parameters.by_name(error), "covariance": covariance}
+        facts["fit"] = {"errors": by_name(generator.response, error), "covariance": covariance}
 
     write_chain(folder, change=change)
     return write_chain(folder, change=change, **facts)

@@ -32,9 +32,8 @@ from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import GruDiscriminator, PositionalUNet
 from cpunet.recipes import schema
 from cpunet.training.run import Record
-from cpunet.training.sides import Judge, Sides
 from cpunet.training.unfinished import State, waiting_signals
-from cpunet.training.views import View, half_sample
+from cpunet.training.views import WON, Judge, Sides, View, half_sample
 
 log = logging.getLogger(__name__)
 
@@ -238,7 +237,8 @@ class Game:
             rows, y, fake = rows[: c.cycle_size], y[: c.cycle_size], fake[: c.cycle_size]
             x, back = sim.pulses[rows], iren(y)
             losses |= self.play("sim", "iren", self.with_noise(rows), back)
-            noise = TOLERATED * self.sides.tolerance(y)
+            rms = y[:, : self.sides.preparation.baseline_samples].std(dim=1, keepdim=True)
+            noise = TOLERATED * rms * (self.sides.noise is not None)  # no generator makes it
             losses["cycle_forward"] = weighted_l1(iren(prepared(fake)) - x, w)
             losses["cycle_backward"] = weighted_l1(prepared(ren(back)) - y, w, noise)
             losses["identity_data"] = weighted_l1(ren.change(y), w)
@@ -301,9 +301,9 @@ class Game:
         for side, pair in pairs.items():
             real, fake = (self.critics[side](self.views[side](pulses)) for pulses in pair)
             results[f"{side}_unseen"] = right = float((real > fake).float().mean())
-            self.judge.note(side, right, self.iteration / self.config.iterations)
-        if not self.judge.winning("data"):
-            self.good.load_state_dict(self.average.state_dict())
+            mean = self.judge.note(side, right, self.iteration / self.config.iterations)
+            if side == "data" and mean <= WON:
+                self.good.load_state_dict(self.average.state_dict())
         return results
 
 
@@ -328,7 +328,8 @@ def train(
         if start is not None:
             game.restore(start)
         c = game.config
-        while game.iteration < c.iterations and not game.judge.ended:
+        over = game.judge.over
+        while game.iteration < c.iterations and over.get("data") != "won" and len(over) < 2:
             losses, done = game.step(), game.iteration
             rate = game.optimisers["pair"].param_groups[0]["lr"]
             records.append({"iteration": done - 1, "rate": rate, "losses": losses})

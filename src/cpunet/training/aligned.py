@@ -66,16 +66,6 @@ class Frame:
         taps, dt_ns = current_amplitude_kernel(config.sampled_ns), config.sampled_ns
         return cls(dt_ns, config.samples(config.before_ns), after, (first, last), level, taps)
 
-    @property
-    def length(self) -> int:
-        """Samples of an aligned pulse."""
-        return self.before + self.after
-
-    @property
-    def reach(self) -> int:
-        """Samples before and after its place that the current amplitude depends on."""
-        return int(self.taps.shape[1]) // 2
-
 
 @dataclass(frozen=True, eq=False)
 class Aligned:
@@ -142,12 +132,12 @@ def read(records: Floats, frame: Frame) -> Aligned:
         slope = np.maximum((derivatives.T * four).sum(axis=1), FLATTEST)
         part = np.clip(part - off / slope, 0, 1)
     weights, derivatives = cubic(part)
-    around = scaled(-before - 2, frame.length + 3)
+    around = scaled(-before - 2, before + frame.after + 3)
     pulses, slopes = between(around, weights), between(around, derivatives)
 
     # the highest smoothed current, three samples before and after the steepest sum over three
     current = np.diff(scaled(-before, before + round(STEEPEST_NS / frame.dt_ns)), axis=1)
-    edge, steps = frame.reach + 3, len(frame.taps)
+    edge, steps = frame.taps.shape[1] // 2 + 3, len(frame.taps)
     three = (current[:, :-2] + current[:, 1:-1] + current[:, 2:])[:, edge:-edge]
     place = three.argmax(axis=1) + edge + 1
     near = np.take_along_axis(current, place[:, np.newaxis] + np.arange(-edge, edge + 1), 1)
@@ -232,15 +222,6 @@ class Basis:
     first: int
     changes: Values
 
-    def __call__(self, sides: Sides, aligned: Aligned, heights: Floats) -> Derivatives:
-        """Derivatives of pulses in these coordinates."""
-        return Derivatives(sides, aligned, heights, self)
-
-    @property
-    def last(self) -> int:
-        """Last lag."""
-        return self.first + len(self.changes) - 1
-
 
 class Derivatives:
     r"""Derivatives in the coordinates of a basis, for pulses with a draw of noise.
@@ -252,12 +233,12 @@ class Derivatives:
 
     Parameters
     ----------
+    basis
+        Coordinates.
     sides
         Pulses.
     aligned, heights
         The translated pulses, and heights of their records before.
-    basis
-        Coordinates.
 
     Attributes
     ----------
@@ -265,25 +246,26 @@ class Derivatives:
         Derivatives of what is read, shape (pulses, coordinates).
     """
 
-    def __init__(self, sides: Sides, aligned: Aligned, heights: Floats, basis: Basis) -> None:
+    def __init__(self, basis: Basis, sides: Sides, aligned: Aligned, heights: Floats) -> None:
         self.sides, self.basis = sides, basis
         self.reversed = basis.changes[::-1].astype(SINGLE)
         self.values, self.slopes = (sides.view(of) for of in (aligned.pulses, aligned.slopes))
         level = slice(*(sides.frame.before + at for at in sides.frame.level))
         self.level = aligned.pulses[:, level].mean(axis=0)
         frame, rows, lags = sides.frame, np.arange(len(aligned)), len(basis.changes)
+        last = basis.first + lags - 1
         height = (aligned.height * heights).astype(SINGLE)[:, np.newaxis]
         weights, _ = cubic(aligned.part)
 
         def mean(ends: tuple[int, int]) -> Floats:
-            first = aligned.sample - 1 - basis.last
+            first = aligned.sample - 1 - last
             low, high = (
                 stretch(sides.charge, first + end, lags) @ self.reversed for end in ends
             )
             return np.asarray((high - low) / SINGLE(ends[1] - ends[0]) / height)
 
         def charge(sample: Samples) -> Floats:
-            first = sample - 2 - basis.last
+            first = sample - 2 - last
             samples = stretch(sides.current, first, lags + 3)
             return np.asarray(between(samples, weights) @ self.reversed / height)
 
@@ -307,14 +289,14 @@ class Derivatives:
         change = np.zeros((len(aligned), basis.changes.shape[1]), SINGLE)
         for step, taps in enumerate(frame.taps):  # of the highest smoothed current
             some = np.flatnonzero(aligned.step == step)
-            first = aligned.steepest[some] - basis.last - frame.reach
+            first = aligned.steepest[some] - last - frame.taps.shape[1] // 2
             records = stretch(sides.current[some], first, lags + frame.taps.shape[1])
             current = np.diff(records, axis=1)
             smooth = sum(tap * current[:, j : j + lags] for j, tap in enumerate(taps))
             change[some] = smooth @ self.reversed
         self.log_amplitude = change / height / column(np.exp(aligned.log_amplitude))
         self.log_amplitude -= self.span
-        self.begin = -frame.before - basis.last
+        self.begin = -frame.before - last
         length = frame.after - basis.first - self.begin + 3
         currents = stretch(sides.current, aligned.sample + self.begin - 2, length)
         self.currents = between(currents, weights) / height
@@ -334,7 +316,7 @@ class Derivatives:
         currents = weights.T @ self.currents[rows]  # (stretches, times)
         sums = np.zeros((len(currents), currents.shape[1] + 1))
         np.cumsum(currents, axis=1, out=sums[:, 1:])
-        lags = np.arange(basis.first, basis.last + 1)
+        lags = basis.first + np.arange(len(basis.changes))
         low = self.sides.first[:, np.newaxis] - self.sides.frame.before - lags - self.begin
         high = np.take_along_axis(sums, low + widths, axis=1)
         change = ((high - np.take_along_axis(sums, low, axis=1)) / widths) @ basis.changes
@@ -393,7 +375,8 @@ class Changes:
         level = aligned.pulses[:, frame.before + frame.level[0] : frame.before + frame.level[1]]
         falling = SINGLE(np.gradient(level.mean(axis=0)).mean())
         weights, _ = cubic(aligned.part)
-        taps, steepest = frame.taps, aligned.steepest - frame.reach
+        taps, steepest = frame.taps, aligned.steepest - frame.taps.shape[1] // 2
+        length = frame.before + frame.after + 3
         for record in records:
             base, top = (
                 stretch(record, aligned.sample + first, last - first).mean(
@@ -401,7 +384,7 @@ class Changes:
                 )
                 for first, last in (frame.base, frame.level)
             )
-            around = stretch(record, aligned.sample - frame.before - 2, frame.length + 3)
+            around = stretch(record, aligned.sample - frame.before - 2, length)
             moved = (between(around, weights) - base) / height
             span = (top - base) / height
             time = (SINGLE(0.5) * span - moved[:, middle]) / slopes[:, middle]

@@ -198,10 +198,11 @@ class Sides:
     def divide(self) -> None:
         """Divide pulses into stretches; the fewer pulses, the longer stretches."""
         frame, most = self.frame, FEWEST * min(len(self), len(self.data))
+        length = frame.before + frame.after
         fine, coarse = (max(1, round(ns / frame.dt_ns)) for ns in (FINEST_NS, COARSE_NS))
         while True:
             first, at = list[int](), 0
-            while at < frame.length:
+            while at < length:
                 first.append(at)
                 dense = DENSE_NS[0] <= (at - frame.before) * frame.dt_ns < DENSE_NS[1]
                 at += fine if dense else max(fine, coarse)
@@ -209,7 +210,7 @@ class Sides:
                 break
             fine *= 2
         self.first = np.array(first)
-        self.widths = np.diff(np.append(self.first, frame.length))
+        self.widths = np.diff(np.append(self.first, length))
         middle = self.first + 0.5 * (self.widths - 1) - frame.before
         self.time_ns: Values = np.asarray(middle * frame.dt_ns)
         self.data_view = self.view(self.data.pulses)

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -188,21 +188,8 @@ class Parabola(NamedTuple):
     gradient: Values
 
 
-class Unknowns(Protocol):
-    """Coordinates with the widths of their priors, longest steps, and bounds."""
-
-    widths: Values
-    longest: Values
-    low: Values
-    high: Values
-
-    def vector(self) -> Values: ...
-
-    def set(self, vector: Values) -> None: ...
-
-
 def minimum(
-    unknowns: Unknowns,
+    unknowns: Any,
     evaluate: Callable[[Values], Parabola],
     steps: int,
     fall: float,
@@ -213,7 +200,8 @@ def minimum(
     Parameters
     ----------
     unknowns
-        Coordinates, at the start.
+        Coordinates at the start, with the widths of their priors, longest steps, and bounds:
+        `SmoothParameters`, or the like.
     evaluate
         Chi-square about a place, to which it sets the coordinates.
     steps

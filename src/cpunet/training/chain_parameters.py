@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -26,42 +25,127 @@ SCALES = {DECAY_WEIGHTS: 0.03, "slow_weights": 0.1, "sharpness": 0.5}
 STEP, STRETCHED = 1e-5, 0.004
 
 
-class Parameters:
-    """The parameters of a response as a vector, with their priors.
+SLOWEST = -0.99  # rate of the slowest decay: a hundred times slower than at the start
+SQUARE_WIDTH = 0.25  # of the prior for the square of half the difference of two logarithms
+
+
+class SmoothParameters:
+    r"""The parameters with their priors, in coordinates on which pulses depend nearly linearly.
+
+    Two poles act alike: pulses depend on the mean of their logarithms and on the *square* of
+    their difference, and each pair is replaced by these.  Where two poles are equal,
+    derivatives with respect to the difference vanish, and steps along it go astray.
+
+    Tails depend on the rate of the main decay times its share.  With the shares :math:`a_i` of
+    the faster ones, its time :math:`\tau` is replaced by
+
+    .. math:: r = \Big(1 - \sum_i a_i\Big) \left(\frac{\tau_0}{\tau} - 1\right).
+
+    Tails determine all these together a hundred times better than each.  In other coordinates,
+    a step between them would curve out of this valley.
 
     Parameters
     ----------
     response
-        Response with the parameters; their current values are the centres of the priors.
+        Response with the parameters.
+    start
+        Response on whose values the priors of the same parameters are centred; those of others
+        on the current ones.  Its decay is :math:`\tau_0`.
+    poles
+        Whether the poles are replaced, too.
+
+    Attributes
+    ----------
+    labels
+        Name of each parameter, without its number.
+    centre, widths, longest, low, high
+        Centres and widths of the priors, longest steps, and bounds.
     """
 
-    response: ElectronicsResponse
-
-    def __init__(self, response: ElectronicsResponse) -> None:
+    def __init__(
+        self,
+        response: ElectronicsResponse,
+        start: ElectronicsResponse | None = None,
+        *,
+        poles: bool = True,
+    ) -> None:
         self.response = response
-        named = response.parameters.items()
-        self.labels = [n for n, p in named for _ in p]
-        self._names = [f"{n}.{i}" for n, p in named for i in range(1, len(p) + 1)]
-        self.centre = self.vector()
+        given = {} if start is None else by_name(start, vector_of(start))
+        current = by_name(response, vector_of(response))
+        centre = np.array([given.get(name, value) for name, value in current.items()])
+        self.labels = [name.rpartition(".")[0] for name in current]
+        named = np.array(self.labels)
         self.widths = np.array([SCALES.get(name, TIME_WIDTH) for name in self.labels])
         self.longest = self.widths.copy()
-        self.low = np.full(len(self.centre), -np.inf)
+        self.low = np.full(len(centre), -np.inf)
         self.high = -self.low
-        of_samples = [label == "sharpness" for label in self.labels]
-        self.low[of_samples], self.high[of_samples] = 0.0, 1.0  # from means to points
-        stretched = [label == STRETCH for label in self.labels]
-        self.widths[stretched] = STRETCH_WIDTHS[: sum(stretched)]
+        self.low[named == "sharpness"] = 0.0  # from means to points
+        self.high[named == "sharpness"] = 1.0
+        stretched = named == STRETCH
+        self.widths[stretched] = STRETCH_WIDTHS[: stretched.sum()]
+        self._plain_widths = self.widths.copy()
+        of_poles = np.flatnonzero(named == POLES).tolist() if poles else []
+        self._pairs = list(zip(of_poles[::2], of_poles[1::2], strict=False))
+        for mean, square in self._pairs:
+            self.widths[mean] /= np.sqrt(2)
+            self.widths[square] = self.longest[square] = SQUARE_WIDTH
+            self.low[square] = 0.0
+        self._shares, self._decay = named == DECAY_WEIGHTS, self.labels.index(DECAY)
+        self._log_reference = centre[self._decay]
+        self.low[self._decay] = SLOWEST
+        self.centre = self._of(centre)
+
+    def _of(self, plain: Values) -> Values:
+        """Coordinates of a vector of parameters."""
+        place, i = plain.copy(), self._decay
+        for mean, square in self._pairs:
+            first, second = plain[mean], plain[square]
+            place[mean], place[square] = 0.5 * (first + second), 0.25 * (first - second) ** 2
+        rate = np.expm1(self._log_reference - plain[i])
+        place[i] = float(1 - plain[self._shares].sum()) * rate
+        return place
 
     def vector(self) -> Values:
-        """Parameters as a vector."""
-        return np.concatenate([*self.response.parameters.values()])
+        """Coordinates of the current response."""
+        return self._of(vector_of(self.response))
 
     def set(self, vector: Values) -> None:
-        """Set the parameters of the response from a vector."""
-        first = 0
+        """Set the response from its coordinates."""
+        plain, i, first = vector.copy(), self._decay, 0
+        for mean, square in self._pairs:
+            half = np.sqrt(max(vector[square], 0.0))
+            plain[mean], plain[square] = vector[mean] + half, vector[mean] - half
+        rate = 1 + vector[i] / float(1 - vector[self._shares].sum())
+        plain[i] = self._log_reference - np.log(max(rate, 1 + SLOWEST))
         for part in self.response.parameters.values():
-            part[:] = vector[first : first + len(part)]
+            part[:] = plain[first : first + len(part)]
             first += len(part)
+
+    def covariance(self, information: Values) -> Values:
+        """Covariance of the parameters themselves, which have priors of their own.
+
+        Parameters
+        ----------
+        information
+            What the data alone tell of the coordinates: products of the derivatives of all
+            residuals but those of the priors.
+        """
+        turn = self.turn()
+        plain = turn.T @ information @ turn + np.diag(self._plain_widths**-2.0)
+        return np.asarray(np.linalg.inv(plain), float)
+
+    def turn(self) -> Values:
+        """Derivatives of the coordinates in the parameters themselves, here."""
+        here, i = self.vector(), self._decay
+        turn = np.eye(len(here))
+        for mean, square in self._pairs:
+            half = np.sqrt(max(here[square], 0.0))
+            turn[mean, [mean, square]] = 0.5
+            turn[square, [mean, square]] = half, -half
+        share = float(1 - here[self._shares].sum())
+        turn[i, self._shares] = -here[i] / share
+        turn[i, i] = -(share + here[i])
+        return turn
 
     def slopes_of_transfer(self, padded: int) -> list[tuple[float, Spectrum]]:
         """Widths of all parameters but a stretch, and how the spectrum changes with each."""
@@ -90,8 +174,8 @@ class Parameters:
 
     def changes(self, sim: FloatArray) -> list[FloatArray]:
         """Changes of simulated pulses with each term of a stretch, the last parameters."""
-        clock, changes = self.response.drift, list[FloatArray]()
-        for i in range(0 if clock is None else len(clock.stretch)):
+        changes = list[FloatArray]()
+        for i in range(self.labels.count(STRETCH)):
             ends = []
             for sign in (-1, 1):
                 moved = copy.deepcopy(self.response)
@@ -102,125 +186,17 @@ class Parameters:
             changes.append(np.asarray(change, np.float32))
         return changes
 
-    def by_name(self, values: Values) -> dict[str, float]:
-        """Values of the parameters by name and number."""
-        return dict(zip(self._names, values.tolist(), strict=True))
+
+def vector_of(response: ElectronicsResponse) -> Values:
+    """The parameters themselves as a vector."""
+    return np.concatenate([*response.parameters.values()])
 
 
-SLOWEST = -0.99  # rate of the slowest decay: a hundred times slower than at the start
-SQUARE_WIDTH = 0.25  # of the prior for the square of half the difference of two logarithms
-
-
-class SmoothParameters(Parameters):
-    r"""The parameters in coordinates on which pulses depend nearly linearly.
-
-    Two poles act alike: pulses depend on the mean of their logarithms and on the *square* of
-    their difference, and each pair is replaced by these.  Where two poles are equal,
-    derivatives with respect to the difference vanish, and steps along it go astray.
-
-    Tails depend on the rate of the main decay times its share.  With the shares :math:`a_i` of
-    the faster ones, its time :math:`\tau` is replaced by
-
-    .. math:: r = \Big(1 - \sum_i a_i\Big) \left(\frac{\tau_0}{\tau} - 1\right).
-
-    Tails determine all these together a hundred times better than each.  In other coordinates,
-    a step between them would curve out of this valley.
-
-    Parameters
-    ----------
-    response
-        Response with the parameters.
-    start
-        Response on whose values the priors of the same parameters are centred; those of others
-        on the current ones.  Its decay is :math:`\tau_0`.
-    poles
-        Whether the poles are replaced, too.
-    """
-
-    _pairs: Sequence[tuple[int, int]] = ()
-    _decay: int | None = None
-
-    def __init__(
-        self,
-        response: ElectronicsResponse,
-        start: ElectronicsResponse | None = None,
-        *,
-        poles: bool = True,
-    ) -> None:
-        super().__init__(response)
-        given = {} if start is None else (own := Parameters(start)).by_name(own.centre)
-        current = self.by_name(self.centre)
-        centre = np.array([given.get(name, value) for name, value in current.items()])
-        of_poles = [i for i, label in enumerate(self.labels) if poles and label == POLES]
-        self._pairs = list(zip(of_poles[::2], of_poles[1::2], strict=False))
-        self._plain_widths = self.widths.copy()
-        for mean, square in self._pairs:
-            self.widths[mean] /= np.sqrt(2)
-            self.widths[square] = self.longest[square] = SQUARE_WIDTH
-            self.low[square] = 0.0
-        self._shares = np.array([label == DECAY_WEIGHTS for label in self.labels])
-        if DECAY in self.labels:
-            self._decay = self.labels.index(DECAY)
-            self._log_reference = centre[self._decay]
-            self.low[self._decay] = SLOWEST
-        self.centre = self._of(centre)
-
-    def vector(self) -> Values:
-        """Coordinates of the current response."""
-        return self._of(super().vector())
-
-    def set(self, vector: Values) -> None:
-        """Set the response from its coordinates."""
-        plain = vector.copy()
-        for mean, square in self._pairs:
-            half = np.sqrt(max(vector[square], 0.0))
-            plain[mean], plain[square] = vector[mean] + half, vector[mean] - half
-        if (i := self._decay) is not None:
-            rate = 1 + vector[i] / self._main_share(vector)
-            plain[i] = self._log_reference - np.log(max(rate, 1 + SLOWEST))
-        super().set(plain)
-
-    def covariance(self, information: Values) -> Values:
-        """Covariance of the parameters themselves, which have priors of their own.
-
-        Parameters
-        ----------
-        information
-            What the data alone tell of the coordinates: products of the derivatives of all
-            residuals but those of the priors.
-        """
-        turn = self.turn()
-        plain = turn.T @ information @ turn + np.diag(self._plain_widths**-2.0)
-        return np.asarray(np.linalg.inv(plain), float)
-
-    def turn(self) -> Values:
-        """Derivatives of the coordinates in the parameters themselves, here."""
-        here = self.vector()
-        turn = np.eye(len(here))
-        for mean, square in self._pairs:
-            half = np.sqrt(max(here[square], 0.0))
-            turn[mean, [mean, square]] = 0.5
-            turn[square, [mean, square]] = half, -half
-        if (i := self._decay) is not None:
-            share = self._main_share(here)
-            turn[i, self._shares] = -here[i] / share
-            turn[i, i] = -(share + here[i])
-        return turn
-
-    def _of(self, plain: Values) -> Values:
-        """Coordinates of a vector of parameters."""
-        place = plain.copy()
-        for mean, square in self._pairs:
-            first, second = plain[mean], plain[square]
-            place[mean], place[square] = 0.5 * (first + second), 0.25 * (first - second) ** 2
-        if (i := self._decay) is not None:
-            rate = np.expm1(self._log_reference - plain[i])
-            place[i] = self._main_share(plain) * rate
-        return place
-
-    def _main_share(self, plain: Values) -> float:
-        """Share of the main decay."""
-        return float(1 - plain[self._shares].sum())
+def by_name(response: ElectronicsResponse, values: Values) -> dict[str, float]:
+    """Values of the parameters by name and number."""
+    parts = response.parameters.items()
+    names = [f"{name}.{i}" for name, part in parts for i in range(1, len(part) + 1)]
+    return dict(zip(names, values.tolist(), strict=True))
 
 
 def with_decay(response: ElectronicsResponse, slope: float) -> ElectronicsResponse:

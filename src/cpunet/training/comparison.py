@@ -194,7 +194,7 @@ class Comparison:
         """Differences of quantiles, then of slices, with derivatives in a basis if given."""
         moves = None if basis is None else basis(self.sides, self.noisy[0], self.heights)
         quantiles, slices = zip(*(self._by(by, moves) for by in RANKS), strict=True)
-        return [*quantiles, *(one for own in slices for one in own)]
+        return [*quantiles, *(difference for own in slices for difference in own)]
 
     def mean_pulse(self) -> Values:
         """Deviation of the mean of all pulses in its standard errors, by stretch.

@@ -28,9 +28,9 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
+from cpunet.training.chain_description import DRIFT, beyond
 from cpunet.training.chain_fit import Fitter
 from cpunet.training.check import Level, compare_sides
-from cpunet.training.diagnosis import DRIFT, beyond
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.pulse_sets import MIN_PULSES, Continuum, PulseSets, continuum
 from cpunet.training.response_fit import fit_response

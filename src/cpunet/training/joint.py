@@ -120,7 +120,7 @@ class Joint:
         transfer
             Spectrum of the response.
         basis
-            Coordinates of the response.
+            Coordinates of the response; None for no derivatives.
         changes
             Derivatives of the simulated pulses in other coordinates, which follow.
         """
@@ -132,14 +132,13 @@ class Joint:
         each = [self._functions(draw[single]) for draw in noisy]
         covariance = self.covariance(0.5 * (np.cov(each[0].T) + np.cov(self.data.T)))
         values = np.mean(each, axis=0)
-        off, moves = values.mean(axis=0) - self.data.mean(axis=0), list[Derivatives | Changes]()
-        if basis is not None:
-            moves = [basis(self.sides, noisy[0], heights)]
+        off = values.mean(axis=0) - self.data.mean(axis=0)
+        if basis is None:
+            return Difference("joint", off, covariance)
+        moves: list[Derivatives | Changes] = [Derivatives(basis, self.sides, noisy[0], heights)]
         if changes:
             records = [self.sides.changed(draw, transfer, heights) for draw in changes]
             moves.append(Changes(self.sides, noisy[0], records))
-        if not moves:
-            return Difference("joint", off, covariance)
         of_each = np.concatenate([self._each(noisy[0], some) for some in moves], axis=2)
         of_log = np.concatenate([some.log_amplitude for some in moves], axis=1)
         parts = np.array_split(np.flatnonzero(single), PARTS)

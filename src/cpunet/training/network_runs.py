@@ -32,9 +32,9 @@ from cpunet.pulses.two_sample import TwoSample, classifier_auc
 from cpunet.recipes.schema import Recipe, TrainingConfig
 from cpunet.training.adversarial import Game, Generator, Residual, train
 from cpunet.training.run import Record, Run
-from cpunet.training.sides import Side, Sides
 from cpunet.training.unfinished import UnfinishedRun
 from cpunet.training.verdict import FitInfo
+from cpunet.training.views import Side, Sides
 
 if TYPE_CHECKING:
     from cpunet.training.job import TrainingJob
@@ -136,11 +136,13 @@ def _played(
             run.records += records
             bar.update(len(records))
 
-        def begin() -> Game:
-            pair = make()
-            return Game(pair["ren"], pair["iren"], sides, settings)
-
-        game = train(begin, job.seed, listener=listen, save=run.save, start=state)
+        game = train(
+            lambda: Game(**make(), sides=sides, settings=settings),
+            job.seed,
+            listener=listen,
+            save=run.save,
+            start=state,
+        )
     return game, run
 
 
