@@ -100,13 +100,7 @@ class TrainingJob:
             return train_networks(self)
 
     def run(
-        self,
-        parts: dict[str, Any],
-        recipe: Recipe,
-        started: str,
-        seconds: float,
-        records: list[Record],
-        **more: Any,
+        self, parts: dict[str, Any], recipe: Recipe, started: str, clock: float, **more: Any
     ) -> Run:
         """The run of trained parts.
 
@@ -116,26 +110,16 @@ class TrainingJob:
             ``ren``, ``iren`` and others to store.
         recipe
             Recipe as trained; a stretch or deviations may have been added to its chain.
-        started, seconds, records
-            When the training began, the time that it took, and its log.
+        started, clock
+            When the training began, and what `time.perf_counter` said then.
         more
-            Further facts of the run.
+            Further facts of the run, as its ``log``.
         """
-        run = Run.of(
-            parts,
-            recipe,
-            peak=self.peak,
-            seed=self.seed,
-            device=self.device,
-            started=started,
-            seconds=round(seconds, 1),
-            dt_ns=self.data.dt_ns,
-            versions=versions(),
-            sim=self.sim.provenance(),
-            data=self.data.provenance(),
-            **more,
-        )
-        return run.model_copy(update={"log": records})
+        facts = {"peak": self.peak, "seed": self.seed, "device": self.device}
+        facts |= {"started": started, "seconds": round(time.perf_counter() - clock, 1)}
+        facts |= {"dt_ns": self.data.dt_ns, "versions": versions()}
+        facts |= {"sim": self.sim.provenance(), "data": self.data.provenance()}
+        return Run.of(parts, recipe, **facts, **more)
 
 
 def of_channel(name: str, pair: Pair, folder: Path, **how: Any) -> Path:
@@ -176,7 +160,7 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
     CpunetError
         If pulses or baselines are too few, or the fit diverges.
     """
-    started, clock = datetime.now(UTC), time.perf_counter()
+    started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
     recipe, sim = job.recipe, job.sim.prepared.pulses
     records = list[Record]()
     with stage("Fitting") as bar:  # the number of steps is not foreseen
@@ -214,8 +198,7 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
         parts |= residuals
         if not residuals:  # the readout alone
             recipe = recipe.model_copy(update={"residual": None})
-    took, began = time.perf_counter() - clock, started.isoformat(timespec="seconds")
-    return job.run(parts, recipe, began, took, records, fit=info)
+    return job.run(parts, recipe, started, clock, log=records, fit=info)
 
 
 def _say(info: FitInfo) -> None:

@@ -92,7 +92,7 @@ def train_networks(job: TrainingJob) -> Run:
         parts["noise"].set_noise(noise.noise)
     more: dict[str, Any] = {"resumed_at": run.resumed_at, "fit": info}
     more = {name: value for name, value in more.items() if value}
-    return job.run(parts, recipe, run.started, run.seconds, run.records, **more)
+    return job.run(parts, recipe, run.started, run.clock, log=run.records, **more)
 
 
 def fill_generator(run: Run, part: str, network: Generator, device: str = "cpu") -> Generator:

@@ -93,23 +93,14 @@ def import_weights(
     settings = {n: v * dt_ns / PUBLISHED_DT_NS for n, v in times if n.endswith("_ns")}
     settings["generator.width"] = widths.pop()
     recipe = load_recipe("published", settings)
-    run = Run.of(
-        networks,
-        recipe,
-        peak="FEP",
-        seed=None,
-        dt_ns=dt_ns,
-        seconds=0.0,
-        device="elsewhere",
-        sim=UNKNOWN,
-        data=UNKNOWN,
-        imported={
-            part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-            for part, path in files.items()
-        },
-        imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
-        versions=versions(),
-    )
+    imported = {
+        part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        for part, path in files.items()
+    }
+    facts = {"peak": "FEP", "seed": None, "dt_ns": dt_ns, "seconds": 0.0, "device": "elsewhere"}
+    facts |= {"sim": UNKNOWN, "data": UNKNOWN, "imported": imported, "versions": versions()}
+    facts["imported_at"] = datetime.now(UTC).isoformat(timespec="seconds")
+    run = Run.of(networks, recipe, **facts)
     return run if out is None else run.save(out, force)
 
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import logging
 import re
@@ -151,18 +149,16 @@ class Response:
         CpunetError
             If the folder exists and `force` is off, or is of something else.
         """
-        content: dict[str, Any] = {"cpunet": cpunet.__version__, "runs": []}
-        for chain in self.runs:
-            facts = {"path": chain.run.name, "recipe": chain.run.recipe.name}
-            facts |= {name: getattr(chain.run, name) for name in _OF_RUN}
-            content["runs"].append(facts | {name: getattr(chain, name) for name in _OF_CHAIN})
+        runs = [
+            {"path": chain.run.name, "recipe": chain.run.recipe.name}
+            | {name: getattr(chain.run, name) for name in _OF_RUN}
+            | {name: getattr(chain, name) for name in _OF_CHAIN}
+            for chain in self.runs
+        ]
+        content: dict[str, Any] = {"cpunet": cpunet.__version__, "runs": runs}
         if self.truth is not None:
-            content["truth"] = {
-                "name": self.truth.name,
-                "values": self.true_values,
-                "difference": self.difference,
-                "sigma": self.sigma,
-            }
+            content["truth"] = {"name": self.truth.name, "values": self.true_values}
+            content["truth"] |= {"difference": self.difference, "sigma": self.sigma}
         folders = [chain.run.folder for chain in self.runs]
         with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
             text = json.dumps(content, indent=1, ensure_ascii=False)
@@ -289,15 +285,18 @@ def as_yaml(chains: Mapping[str, DescribedChain]) -> str:
 
 def as_csv(chains: Mapping[str, DescribedChain]) -> str:
     """A line for each channel: each number with its error."""
-    names = list(dict.fromkeys(n for chain in chains.values() for n in chain.values))
-    stream = io.StringIO()
-    writer = csv.writer(stream, lineterminator="\n")
-    columns = [f"{name}{end}" for name in names for end in ("", "_error")]
-    writer.writerow(["channel", "good", *columns])
-    for channel, chain in chains.items():
-        cells = [of.get(n, "") for n in names for of in (chain.values, chain.errors)]
-        writer.writerow([channel, int(chain.run.ok), *cells])
-    return stream.getvalue()
+    from pandas import DataFrame
+
+    rows = {
+        channel: {"good": int(chain.run.ok)}
+        | {
+            f"{name}{end}": of.get(name)
+            for name in chain.values
+            for end, of in (("", chain.values), ("_error", chain.errors))
+        }
+        for channel, chain in chains.items()
+    }
+    return str(DataFrame.from_dict(rows, orient="index").to_csv(index_label="channel"))
 
 
 def outliers(values: Sequence[float | None], errors: Sequence[float | None]) -> list[bool]:
@@ -329,7 +328,7 @@ def array_page(chains: Mapping[str, DescribedChain]) -> str:
         if any(value is not None for value in values):
             texts = [with_std(v, e) for v, e in zip(values, errors, strict=True)]
             columns[title] = list(zip(texts, outliers(values, errors), strict=True))
-    rows: list[dict[str, Any]] = []
+    rows = list[dict[str, Any]]()
     for i, (channel, chain) in enumerate(chains.items()):
         cells = [column[i] for column in columns.values()]
         marked = sum(far for _, far in cells) + (not chain.run.ok)
