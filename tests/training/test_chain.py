@@ -11,12 +11,9 @@ import pytest
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run
 from cpunet.training.train import train
-from cpunet.translation.file_translation import Counts
-from cpunet.translation.translate import translate
 from cpunet.translation.translator import REN
 from synthetic import (
     Files,
@@ -116,23 +113,6 @@ def test_noise_needs_baselines(tmp_path: Path) -> None:
     recipe = load_recipe("published", tiny)
     parts = ("2.lh5: no baselines to draw noise from", "training.noise=none")
     one_line(lambda: train(*few, tmp_path / "run", recipe=recipe, device="cpu"), *parts)
-
-
-@pytest.mark.parametrize("inverse", [False, True])
-def test_files_are_translated_in_both_directions(
-    run: Run, files: Files, tmp_path: Path, inverse: bool
-) -> None:
-    source = files.data if inverse else files.sim
-    out = tmp_path / "out.lh5"
-    told = translate(run.folder, source, out, inverse=inverse).counts
-    assert told == Counts(N, N)
-    windows = open_pulses(out).read()
-    assert windows.waveforms.shape == (N, 800)
-    quiet = np.sqrt((windows.waveforms[:, 210:260] ** 2).mean())
-    if inverse:
-        assert quiet < 0.5 * NOISE_KEV / KEV
-    else:
-        assert quiet == pytest.approx(NOISE_KEV * 0.89 / KEV, rel=0.1)
 
 
 @pytest.mark.thorough

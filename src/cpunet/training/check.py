@@ -234,7 +234,7 @@ def check(
 def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult:
     """Read both sides as in a training, and compare them."""
     if isinstance(pair, CpunetError):
-        return CheckResult([_refusal(pair)])
+        return CheckResult([_judged(pair.text, pair.remedy, fine=False, other=True)])
     selection, findings = parse_selection(peak, recipe.peaks), list[Finding]()
     sets: dict[str, InputSet] = {}
     kinds: tuple[tuple[str, Kind], ...] = (("data", "measured"), ("sim", "simulated"))
@@ -244,7 +244,7 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
             sets[side] = load_pulses(file, kind, recipe, selection, **how)
             recipe = sets[side].recipe
         except CpunetError as error:
-            findings.append(_refusal(error))
+            findings.append(_judged(error.text, error.remedy, fine=False, other=True))
     if len(sets) == 2:
         findings += compare_sides(sets["sim"], sets["data"], selection, recipe.preparation)
     return CheckResult(findings, sets if len(sets) == 2 else {})
@@ -261,7 +261,7 @@ def compare_sides(
         notes = require_both_sides(sim, data, selection)
         findings += [Finding(Level.WARNING, note) for note in notes]
     except CpunetError as error:
-        return [*findings, _refusal(error)]
+        return [*findings, _judged(error.text, error.remedy, fine=False, other=True)]
     findings += (too_short := _too_short(sim, preparation))
     for inputs, side in ((sim, "simulated"), (data, "measured")):
         findings += _of_side(inputs, side, selection, shares=not too_short)
@@ -286,10 +286,6 @@ def _judged(text: str, remedy: str, fine: bool, other: bool = False) -> Finding:
     if fine:
         return Finding(Level.FINE, text)
     return Finding(Level.ERROR if other else Level.WARNING, text, remedy)
-
-
-def _refusal(error: CpunetError) -> Finding:
-    return Finding(Level.ERROR, error.text, error.remedy)
 
 
 LONGER = (

@@ -122,17 +122,14 @@ class TrainingJob:
         return Run.of(parts, recipe, **facts, **more)
 
 
-def of_channel(name: str, pair: Pair, folder: Path, **how: Any) -> Path:
-    """The folder of the run of a channel, trained in a process of its own."""
-    if how["resume"] and (folder / INFO).is_file():
+def trained_in(name: str, pair: Pair, out: Path | None, *, force: bool, **how: Any) -> Run:
+    """Read both sides, train and write a run; `how` is what `TrainingJob.of` takes.
+
+    Of several channels, each has a name, and a run that is complete is resumed by loading it.
+    """
+    if name and out is not None and how["resume"] and (out / INFO).is_file():
         log.info(f"{name}: trained already")
-        return folder
-    trained_in(folder, pair, **how)
-    return folder
-
-
-def trained_in(out: Path | None, pair: Pair, force: bool, **how: Any) -> Run:
-    """Read both sides, train and write a run; `how` is what `TrainingJob.of` takes."""
+        return Run.load(out)
     files = *pair[0].files, *pair[1].files
     networks, folder = how["recipe"].networks, None
     if networks:

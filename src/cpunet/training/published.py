@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -97,7 +98,13 @@ def import_weights(
         part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
         for part, path in files.items()
     }
-    facts = {"peak": "FEP", "seed": None, "dt_ns": dt_ns, "seconds": 0.0, "device": "elsewhere"}
+    facts: dict[str, Any] = {
+        "peak": "FEP",
+        "seed": None,
+        "dt_ns": dt_ns,
+        "seconds": 0.0,
+        "device": "elsewhere",
+    }
     facts |= {"sim": UNKNOWN, "data": UNKNOWN, "imported": imported, "versions": versions()}
     facts["imported_at"] = datetime.now(UTC).isoformat(timespec="seconds")
     run = Run.of(networks, recipe, **facts)
@@ -128,10 +135,10 @@ def _generator(path: Path, length: int) -> PositionalUNet:
             f"{path}: no plain state dict of tensors, or damaged ({type(error).__name__}); "
             "nothing of it was executed"
         ) from error
-    pairs = state.items() if isinstance(state, dict) else [(None, state)]
-    if not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in pairs):
-        raise CpunetError(f"{path}: no state dict; give a file such as fep_REN.pt")
-    first = state.get("inc.double_conv.0.weight")
+    named_tensors = isinstance(state, dict) and all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    )
+    first = state.get("inc.double_conv.0.weight") if named_tensors else None
     width = 0 if first is None or first.ndim == 0 else len(first)
     if width < 2 or width % 2:
         raise CpunetError(
