@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import scipy.fft
 
-from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, deviation_lags
+from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Basis, Values
 
@@ -147,29 +147,21 @@ class SmoothParameters:
         turn[i, i] = -(share + here[i])
         return turn
 
-    def slopes_of_transfer(self, padded: int) -> list[tuple[float, Spectrum]]:
-        """Widths of all parameters but a stretch, and how the spectrum changes with each."""
-        slopes: list[tuple[float, Spectrum]] = []
-        for i, label in enumerate(self.labels):
-            if label == STRETCH:
-                continue
-            here, step, spectra = self.vector(), STEP * self.widths[i], []
+    def basis(self, padded: int) -> Basis:
+        """Changes of the step response with all parameters but a stretch, the last."""
+        here, changes = self.vector(), []
+        for i in range(len(here) - self.labels.count(STRETCH)):
+            step, spectra = STEP * self.widths[i], []
             low, high = max(here[i] - step, self.low[i]), here[i] + step
             for end in (low, high):
                 moved = here.copy()
                 moved[i] = end
                 self.set(moved)
                 spectra.append(self.response.transfer(padded))
-            self.set(here)
-            change = (spectra[1] - spectra[0]) / (high - low)
-            slopes.append((float(self.widths[i]), change))
-        return slopes
-
-    def basis(self, padded: int) -> Basis:
-        """Changes of the step response with each parameter but a stretch."""
+            changes.append((spectra[1] - spectra[0]) / (high - low))
+        self.set(here)
         lags = deviation_lags(float(self.response.dt_ns))
-        changes = np.array([change for _, change in self.slopes_of_transfer(padded)])
-        steps = scipy.fft.irfft(changes, padded)
+        steps = scipy.fft.irfft(np.array(changes), padded)
         return Basis(int(lags[0]), np.ascontiguousarray(steps[:, lags].T))
 
     def changes(self, sim: FloatArray) -> list[FloatArray]:

@@ -199,31 +199,22 @@ class Knots:
             knots.append(min(knots[-1] + max(1, round(step)), last))
         places = np.array(knots)
         self.time_ns = places * dt_ns
-
         time, inside = lags * dt_ns, lags <= last
         late = DENSE_NS * (1 + np.log(np.maximum(time, 1.0) / DENSE_NS))
         scaled = np.where(time < DENSE_NS, time, late)
-        of_knots = scaled[places - lags[0]]
-        spline = CubicSpline(of_knots, np.eye(len(knots)), bc_type="natural")
+        spline = CubicSpline(scaled[places - lags[0]], np.eye(len(knots)), bc_type="natural")
         self.between = np.zeros((len(lags), len(knots)))
         self.between[inside] = spline(scaled[inside])
-
-        def at_lags(transfer: Spectrum) -> Values:
-            step = scipy.fft.irfft(transfer, padded)
-            first = int(lags[0])
-            return np.concatenate([step[first:], step[: len(lags) + first]])
-
-        base = at_lags(response.transfer(padded))
+        base = scipy.fft.irfft(response.transfer(padded), padded)[lags]
         # beyond the last knot a deviation decays with the chain
         self.between[~inside, -1] = base[~inside] / base[last - lags[0]]
-        columns = [
-            FREE * width * at_lags(change)
-            for width, change in SmoothParameters(response).slopes_of_transfer(padded)
-        ]
+        parameters = SmoothParameters(response)
+        changes = parameters.basis(padded).changes
         # half a sample of delay, and a variance of a sample squared, of either sign
         slope = np.gradient(base)
-        columns += [0.5 * slope, 0.5 * np.gradient(slope)]
-        self.tangents = np.column_stack(columns)[places - lags[0]]
+        others = 0.5 * slope, 0.5 * np.gradient(slope)
+        free = FREE * parameters.widths[: changes.shape[1]] * changes
+        self.tangents = np.column_stack([free, *others])[places - lags[0]]
 
     def covariance(self, prior: Prior) -> Values:
         """Prior covariance of the deviations at the knots, with the chain's directions."""
