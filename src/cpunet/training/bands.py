@@ -92,16 +92,6 @@ class Noise:
             decay = np.asarray(tails.decay(length), np.float32)
         return cls(traces, trace, start, np.asarray(factor, np.float32), left, decay)
 
-    def of(self, rows: Rows) -> Noise:
-        """Noise of some of the pulses."""
-        return replace(
-            self,
-            trace=np.ascontiguousarray(self.trace[:, rows]),
-            start=np.ascontiguousarray(self.start[:, rows]),
-            factor=np.ascontiguousarray(self.factor[:, rows]),
-            left=None if self.left is None else self.left[:, rows],
-        )
-
     def add(self, records: FloatArray, draw: int) -> FloatArray:
         """Records of the pulses with the noise of a draw."""
         noisy = np.empty(records.shape, np.float32)
@@ -241,7 +231,10 @@ class Sides:
         some = copy.copy(self)
         for name in ("sim", "current", "charge", "spectra", "energy_kev", "rows"):
             setattr(some, name, getattr(self, name)[rows])
-        some.noise = self.noise.of(rows)
+        noise, names = self.noise, ("trace", "start", "factor")
+        drawn = {name: np.ascontiguousarray(getattr(noise, name)[:, rows]) for name in names}
+        left = None if noise.left is None else noise.left[:, rows]
+        some.noise = replace(noise, left=left, **drawn)
         return some
 
     def late_rms(self, aligned: Aligned) -> Values:
