@@ -155,7 +155,7 @@ class Game:
     ) -> None:
         self.ren, self.iren, self.sides, self.config = ren, iren, sides, settings.training
         c, critic, device = settings.training, settings.discriminator, sides.data.pulses.device
-        gru, own = isinstance(critic, schema.GruConfig), sides.preparation
+        own, gru = sides.preparation, isinstance(critic, schema.GruConfig)
         self.weights = window_weights(c.losses, own.length).to(device)
         some = self.with_noise(sides.sim.draw(min(SOME, 4 * sides.sim.seen)))
         real = {"data": sides.data.pulses[: sides.data.seen], "sim": some}
@@ -183,7 +183,7 @@ class Game:
         }
         unseen = min(len(side.pulses) - side.seen for side in sides[:2])
         self.judge, self.lazy = Judge([*real], unseen), LAZY if gru else 1
-        self.iteration, self.right = 0, dict[str, float]()
+        self.iteration = 0
         names = "generators", "critics", "average", "good"
         self.parts: dict[str, Any] = {name: getattr(self, name) for name in names}
         self.parts |= self.optimisers  # which a state is of
@@ -192,7 +192,6 @@ class Game:
         """All that the next iterations depend on, except pulses and settings."""
         return {
             "iteration": self.iteration,
-            "right": dict(self.right),
             "judge": copy.deepcopy(vars(self.judge)),
             "random": [torch.get_rng_state(), *torch.cuda.get_rng_state_all()],
             "parts": {name: part.state_dict() for name, part in self.parts.items()},
@@ -200,7 +199,7 @@ class Game:
 
     def restore(self, state: State) -> None:
         """Continue from a state of the same pulses and settings."""
-        self.iteration, self.right = state["iteration"], dict(state["right"])
+        self.iteration = state["iteration"]
         vars(self.judge).update(copy.deepcopy(state["judge"]))
         for name, part in self.parts.items():
             part.load_state_dict(state["parts"][name])
@@ -269,7 +268,7 @@ class Game:
             if c.penalty and self.iteration % self.lazy == 0:
                 loss = loss + self.lazy * c.penalty * slopes_squared(critic, both)
             self.follow(loss, side)
-            self.right[side] = float((better > worse).float().mean())
+            self.judge.right[side] = float((better > worse).float().mean())
         critic.requires_grad_(False)
         if isinstance(critic, GruDiscriminator):
             critic.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
@@ -289,7 +288,7 @@ class Game:
     @torch.no_grad()
     def judged(self) -> dict[str, float]:
         """Part of pairs that critics order rightly: of the training, and of unseen pulses."""
-        results, n = dict(self.right), self.config.batch_size
+        results, n = dict(self.judge.right), self.config.batch_size
         if not self.judge.unseen:
             return results
         rows, others = (side.draw(n, unseen=True) for side in self.sides[:2])

@@ -197,23 +197,18 @@ def summary(run: Run) -> list[tuple[str, str]]:
     fit, where = run.fit or FitInfo(), run.name
     worst = sorted(fit.pulls, key=lambda name: -abs(fit.pulls[name]))[:WORST]
     off = (f"{name} {fit.pulls[name]:+.1f} σ" for name in worst if abs(fit.pulls[name]) > _FAR)
-    delay = (
-        f"{fit.delay_ns:.1f} ns, half rise of a step; translated pulses have it taken off t0"
-    )
+    when = f"{run.started[:16].replace('T', ' ')}, {run.seconds:.4g} s on {run.device}"
+    taken = "ns, half rise of a step; translated pulses have it taken off t0"
     lines = [
         ("run", where),
-        (
-            "trained",
-            f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; "
-            f"{run.started[:16].replace('T', ' ')}, {run.seconds:.4g} s on {run.device}",
-        ),
+        ("trained", f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; {when}"),
         ("simulated", _side(run.sim)),
         ("measured", _side(run.data)),
         ("fit", fit.verdict),
         ("off", ", ".join(off)),
         *(("cause", cause) for cause in fit.causes),
         ("response", ", ".join(_parameter(*item) for item in fit.parameters.items())),
-        ("delay", f"{fit.delay_ns:.1f} ns, {delay}" if fit.delay_ns else ""),
+        ("delay", f"{fit.delay_ns:.1f} {taken}" if fit.delay_ns else ""),
     ]
     if "baselines" in fit.noise:
         size = ""

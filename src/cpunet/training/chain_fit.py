@@ -42,8 +42,6 @@ DAMPING, MORE, TRIES = 0.03, 8.0, 5
 POOR = 5.0
 SLOW = 0.03  # share by which a step must lower a chi-square that is as poor as that
 
-Listener = Callable[[int, float], None]
-
 
 @dataclass(eq=False)
 class Fitter:
@@ -62,15 +60,14 @@ class Fitter:
     """
 
     training: MatchingConfig
-    listener: Listener | None = None
+    listener: Callable[[int, float], None] = lambda *_: None
     steps: int = 0
     gains: dict[str, str] = field(default_factory=dict)
 
     def count(self, chi_square: float) -> None:
         """Count a step, and report it."""
         self.steps += 1
-        if self.listener is not None:
-            self.listener(self.steps, chi_square)
+        self.listener(self.steps, chi_square)
 
 
 class Fitted(NamedTuple):

@@ -109,10 +109,19 @@ class Judge:
         Names of the critics.
     unseen
         Number of pulses of a side that are held out.
+
+    Attributes
+    ----------
+    over
+        Critics whose game is over, and how it ended: ``"won"`` or ``"chance"``.
+    right
+        Part of pairs of the last batch that each critic ordered rightly.
+    recent
+        The same of unseen pulses, the last judgements.
     """
 
     def __init__(self, sides: Sequence[str], unseen: int) -> None:
-        self.unseen, self.over = unseen, dict[str, str]()
+        self.unseen, self.over, self.right = unseen, dict[str, str](), dict[str, float]()
         self.recent: dict[str, list[float]] = {side: [] for side in sides}
 
     def note(self, side: str, right: float, done: float) -> float:
