@@ -50,16 +50,27 @@ LEAST = 0.02  # part of the mean square of a cycle that a gain must be
 _LOGS: Any = {"log_interval", "checkpoint_interval"}
 
 
-def generators(recipe: Recipe, decay: float = 0.0) -> dict[str, Generator]:
-    """New generators, with a learned linear part or none; `decay` is the data's per sample."""
+def generators(
+    recipe: Recipe, decay: float = 0.0, linear: Mapping[str, nn.Module] | None = None
+) -> dict[str, Generator]:
+    """New generators.
+
+    Parameters
+    ----------
+    recipe
+        Recipe of networks; as published, generators have no linear part.
+    decay
+        Of the data per sample, where the learned linear part begins.
+    linear
+        Solved linear parts; None for those that are learned.
+    """
     config, preparation = recipe.cyclegan.generator, recipe.preparation
     if config.linear == "none":
-        return {
-            part: Generator(PositionalUNet(config, preparation.length))
-            for part in ("ren", "iren")
-        }
-    response = LearnedResponse(preparation, decay)
-    linear = {"ren": response, "iren": LearnedInverse(response)}
+        length = preparation.length
+        return {part: Generator(PositionalUNet(config, length)) for part in ("ren", "iren")}
+    if linear is None:
+        response = LearnedResponse(preparation, decay)
+        linear = {"ren": response, "iren": LearnedInverse(response)}
     dt_ns = preparation.sampled_ns
     return {part: Generator(Residual(config, dt_ns), of) for part, of in linear.items()}
 
@@ -184,15 +195,10 @@ def learned_residuals(
         if n >= ENOUGH:
             why = "they know no energies, by which the electronics act"
         return {}, {"networks": f"left out; {why}"}, []
-    config, preparation = recipe.cyclegan.generator, recipe.preparation
+    response = SolvedResponse(chain.response, recipe.preparation)
+    linear = {"ren": response, "iren": SolvedInverse(inverse)}
     noise = TraceNoise(chain.noise, chain.tails)
-
-    def make() -> dict[str, Generator]:
-        linear = SolvedResponse(chain.response, preparation), SolvedInverse(inverse)
-        made = (Generator(Residual(config, preparation.sampled_ns), of) for of in linear)
-        return dict(zip(("ren", "iren"), made, strict=True))
-
-    game, run = _played(job, recipe, make, noise)
+    game, run = _played(job, recipe, partial(generators, recipe, linear=linear), noise)
     parts, gains = dict[str, Residual](), dict[str, str]()
     for name, (scale, line) in (
         ("ren", _ren_scale(game, chain, recipe)),
