@@ -148,18 +148,18 @@ class SmoothParameters:
         return turn
 
     def basis(self, padded: int) -> Basis:
-        """Changes of the step response with all parameters but a stretch, the last."""
-        here, changes = self.vector(), []
-        for i in range(len(here) - self.labels.count(STRETCH)):
-            step, spectra = STEP * self.widths[i], []
+        """Changes of the step response with each parameter but those of a stretch."""
+        changes = []
+        for i in range(len(self.labels) - self.labels.count(STRETCH)):
+            here, step, spectra = self.vector(), STEP * self.widths[i], []
             low, high = max(here[i] - step, self.low[i]), here[i] + step
             for end in (low, high):
                 moved = here.copy()
                 moved[i] = end
                 self.set(moved)
                 spectra.append(self.response.transfer(padded))
+            self.set(here)
             changes.append((spectra[1] - spectra[0]) / (high - low))
-        self.set(here)
         lags = deviation_lags(float(self.response.dt_ns))
         steps = scipy.fft.irfft(np.array(changes), padded)
         return Basis(int(lags[0]), np.ascontiguousarray(steps[:, lags].T))
