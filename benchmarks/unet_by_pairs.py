@@ -29,7 +29,7 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.adversarial import weighted_l1, window_weights
 from cpunet.training.network_runs import generators, settle
 from cpunet.training.run import Run, versions
-from cpunet.training.sides import Side
+from cpunet.training.views import Side
 from cpunet.validation.comparisons import Missing
 from cpunet.validation.evaluation import evaluate
 from cpunet.validation.methods import true_responses

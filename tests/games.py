@@ -12,7 +12,7 @@ from cpunet.networks.positional_unet import GruDiscriminator
 from cpunet.recipes.schema import Recipe
 from cpunet.training.adversarial import Game
 from cpunet.training.network_runs import generators
-from cpunet.training.sides import Side, Sides
+from cpunet.training.views import Side, Sides
 from synthetic import NOISE_BINS, NOISE_SAMPLES, decay, edges, load_recipe, small_sides
 
 # 64-sample pulses and the narrowest networks: an iteration takes milliseconds.

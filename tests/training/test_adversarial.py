@@ -26,9 +26,8 @@ from cpunet.training.adversarial import (
     weighted_l1,
     window_weights,
 )
-from cpunet.training.judging import RECENT, Judge
 from cpunet.training.network_runs import settle
-from cpunet.training.views import View, aligned, nominal
+from cpunet.training.views import RECENT, Judge, View, aligned, nominal
 from games import as_published, game_of, mended, windows
 from synthetic import LOSS_NAMES, interrupted_in, load_recipe
 
@@ -265,12 +264,9 @@ def test_games_that_are_over(caplog, accuracy, done, how):
     caplog.set_level("INFO", "cpunet")
     judge = Judge(["data"], unseen=400)
     for _ in range(RECENT):
-        judge.add("data", accuracy, done)
+        judge.note("data", accuracy, done)
     assert judge.over.get("data") == how
     assert len(caplog.messages) == (how is not None)
-    other = Judge(["data"], unseen=400)
-    other.load_state_dict(judge.state_dict())
-    assert (other.values, other.over) == (judge.values, judge.over)
 
 
 def test_a_critic_that_has_won_leaves_the_last_good_average():
@@ -310,7 +306,7 @@ def test_a_step_response_is_learned_from_unpaired_pulses():
         "paper", ["training.iterations=250", "training.held_out=0.1", "discriminator.hidden=32"]
     )
     game = train(partial(game_of, recipe, n=1500), 0)
-    ren, (sim, data) = game.averaged("ren"), (side.pulses for side in game.sides[:2])
+    ren, (sim, data) = game.average["ren"], (side.pulses for side in game.sides[:2])
     with torch.no_grad():
         made = aligned(nominal(ren(sim), recipe.preparation), recipe.preparation)
         apart = made.mean(dim=0) - aligned(data, recipe.preparation).mean(dim=0)

@@ -10,28 +10,15 @@ import pytest
 
 from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run
 from cpunet.training.train import train
-from cpunet.translation.translate import translate
-from cpunet.translation.translation import Counts
 from cpunet.translation.translator import REN
-from synthetic import (
-    Files,
-    after_pole_and_decay,
-    in_traces,
-    load_recipe,
-    one_line,
-    sampled,
-    two_sites,
-    write_pulses,
-)
+from synthetic import Files, load_recipe, one_line, write_line, write_pulses
 
-DT_NS, FINE = 16.0, 16
-POLE_NS, DECAY_US, NOISE_KEV, KEV = 70.0, 60.0, 2.0, 2614.511
-N = 420
+DT_NS, N = 16.0, 420
+# of `write_line`: 4000 samples, 20 of 26000 ADC
+POLE_NS, DECAY_US, NOISE_KEV, ADC_PER_KEV = 70.0, 64.0, 2.01, 9.944
 PREPARED = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)  # height of a prepared pulse
 ONE_START = (
     "generator.poles_ns=[50]",
@@ -43,40 +30,11 @@ ONE_START = (
 RECIPE = load_recipe("fast", ONE_START)
 
 
-def charge(n: int, seed: int) -> np.ndarray:
-    """Charge of two sites with logistic edges, finely sampled."""
-    rng = np.random.default_rng(seed)
-    time = (np.arange(225 * FINE) + 0.5) / FINE
-
-    def site() -> np.ndarray:
-        place = rng.uniform(60, 110, (n, 1))
-        return 1 / (1 + np.exp(-(time - place) / rng.uniform(1.5, 3.0, (n, 1))))
-
-    return two_sites(rng, n, site)
-
-
-def digitised(n: int, seed: int, *, noise_kev: float = NOISE_KEV) -> FloatArray:
-    """Traces in ADC behind a pole and a decay, by recursion, with white noise."""
-    pulses = in_traces(charge(n, seed), FINE)
-    fine = after_pole_and_decay(pulses, DT_NS / FINE, POLE_NS, 1e3 * DECAY_US)
-    clean = sampled(fine, FINE).astype(np.float32)
-    noise = np.random.default_rng(seed + 100).normal(0, noise_kev, clean.shape)
-    return np.round(15_000 + 9.6 * (KEV * clean + noise)).astype(np.float32)
-
-
-def written(path: Path, waveforms: FloatArray, kev: float = KEV) -> PulseFile:
-    energies = np.full(len(waveforms), kev)
-    write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies))
-    return PulseFile(path)
-
-
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     folder = tmp_path_factory.mktemp("files")
-    return Files(
-        written(folder / "sim.lh5", sampled(charge(N, seed=1), FINE)),
-        written(folder / "data.lh5", digitised(N, seed=2)),
-    )
+    sim = write_line(folder / "sim.lh5", 1, None, n=N)
+    return Files(sim, write_line(folder / "data.lh5", 2, POLE_NS / DT_NS, n=N))
 
 
 @pytest.fixture(scope="module")
@@ -101,7 +59,7 @@ def test_a_run_tells_of_its_fit(run: Run) -> None:
 
 
 def test_pulses_that_cannot_be_compared_leave_nothing(files: Files, tmp_path: Path) -> None:
-    few = written(tmp_path / "few.lh5", sampled(charge(40, seed=1), FINE))
+    few = write_line(tmp_path / "few.lh5", 1, None, n=40)
     with pytest.raises(CpunetError, match=r"^40 simulated and \d+ measured pulses; 200 of"):
         train(few, files.data, tmp_path / "run", recipe=RECIPE)
     with pytest.raises(CpunetError, match=r"neither has a pulse of 300-400 that can be used"):
@@ -111,28 +69,11 @@ def test_pulses_that_cannot_be_compared_leave_nothing(files: Files, tmp_path: Pa
 
 def test_noise_needs_baselines(tmp_path: Path) -> None:
     tiny = ["training.noise=baselines", "generator.width=2", "training.iterations=1"]
-    sim = written(tmp_path / "1.lh5", sampled(charge(20, seed=1), FINE))
-    few = sim, written(tmp_path / "2.lh5", digitised(20, seed=2))
+    sim = write_line(tmp_path / "1.lh5", 1, None, n=20)
+    few = sim, write_line(tmp_path / "2.lh5", 2, POLE_NS / DT_NS, n=20)
     recipe = load_recipe("published", tiny)
     parts = ("2.lh5: no baselines to draw noise from", "training.noise=none")
     one_line(lambda: train(*few, tmp_path / "run", recipe=recipe, device="cpu"), *parts)
-
-
-@pytest.mark.parametrize("inverse", [False, True])
-def test_files_are_translated_in_both_directions(
-    run: Run, files: Files, tmp_path: Path, inverse: bool
-) -> None:
-    source = files.data if inverse else files.sim
-    out = tmp_path / "out.lh5"
-    told = translate(run.folder, source, out, inverse=inverse).counts
-    assert told == Counts(N, N)
-    windows = open_pulses(out).read()
-    assert windows.waveforms.shape == (N, 800)
-    quiet = np.sqrt((windows.waveforms[:, 210:260] ** 2).mean())
-    if inverse:
-        assert quiet < 0.5 * NOISE_KEV / KEV
-    else:
-        assert quiet == pytest.approx(NOISE_KEV * 0.89 / KEV, rel=0.1)
 
 
 @pytest.mark.thorough
@@ -140,12 +81,20 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level("INFO", "cpunet")
-    traces, rng = digitised(N, seed=2), np.random.default_rng(7)
+    whole, rng = files.data.open().read(), np.random.default_rng(7)
     law = TailsLaw(2.5, DECAY_US, (100, 300, 900, 2000))
     left = law.draw(N, rng)[:, np.newaxis]
-    decay = np.exp(-np.arange(traces.shape[1]) * DT_NS * 1e-3 / DECAY_US)
-    data = written(tmp_path / "data.lh5", np.round(traces + 9.6 * left * decay))
-    made = train(files.sim, data, tmp_path / "run", recipe=RECIPE, seed=3, device="cpu")
+    decay = np.exp(-np.arange(whole.length) * DT_NS * 1e-3 / DECAY_US)
+    traces = np.round(whole.waveforms + ADC_PER_KEV * left * decay)
+    write_pulses(tmp_path / "data.lh5", whole.with_waveforms(traces))
+    made = train(
+        files.sim,
+        PulseFile(tmp_path / "data.lh5"),
+        tmp_path / "run",
+        recipe=RECIPE,
+        seed=3,
+        device="cpu",
+    )
     fit = made.fit.model_dump()
     assert fit["chi_square"] < 1.6 * fit["moments"]
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import csv
 import json
+import re
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -17,6 +19,7 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.chain_parameters import by_name, vector_of
 from cpunet.training.closed_forms import learned_chain, moved_along_axes, true_chain_of
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
@@ -322,3 +325,54 @@ def test_what_is_known_together_has_a_small_error() -> None:
 @pytest.mark.parametrize("covariance", [[], [[1.0]], np.full((5, 5), np.nan).tolist()])
 def test_without_a_covariance_there_are_no_errors(covariance: list[list[float]]) -> None:
     assert moved_along_axes(RESPONSE, covariance, numbers) == {}
+
+
+@pytest.fixture(scope="module")
+def array(tmp_path_factory) -> tuple[Path, list[Path]]:
+    """Channels with small errors of all parameters, one with a pole of its own."""
+    folder, runs = tmp_path_factory.mktemp("array"), []
+    chain = ElectronicsResponse(load_recipe("fast").matching[0], DT_NS)
+    errors = np.full(len(vector_of(chain)), 1e-4)
+    fit = {"errors": by_name(chain, errors), "covariance": np.diag(errors**2).tolist()}
+    for pole in (30.0, 30.5, 29.5, 30.2, 29.8, 60.0):
+        setting = f"generator.poles_ns=[45, {pole}]"
+        runs.append(write_response(folder / f"V{len(runs):02d}", setting, fit=fit))
+    response(*runs, out=folder / "array")
+    return folder / "array", runs
+
+
+def test_a_channel_that_differs_comes_first_and_is_marked(array):
+    folder, runs = array
+    html = (folder / "response.html").read_text()
+    assert "Readouts of 6 channels: 1 to look at" in html
+    rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', html)
+    assert rows[0][0] == str(runs[5])
+    assert 'class="off"' in rows[0][1]
+    assert not any('class="off"' in cells for _, cells in rows[1:])
+
+
+def test_both_tables_have_the_numbers_of_the_command(array):
+    folder, runs = array
+    known = json.loads((folder / "response.json").read_text())["runs"]
+    whole = yaml.safe_load((folder / "response.yaml").read_text())
+    with (folder / "response.csv").open() as stream:
+        rows = {row["channel"]: row for row in csv.DictReader(stream)}
+    for run, numbers in zip(runs, known, strict=True):
+        for name, value in numbers["values"].items():
+            assert whole[str(run)]["numbers"][name]["value"] == pytest.approx(value)
+            assert float(rows[str(run)][name]) == pytest.approx(value)
+
+
+def test_correlations_are_those_of_the_errors(array):
+    folder, runs = array
+    whole = yaml.safe_load((folder / "response.yaml").read_text())[str(runs[0])]
+    names = whole["correlations"]["names"]
+    matrix = np.array(whole["correlations"]["matrix"])
+    assert {"rise_10_90_ns", "missing_500_ns", "effective_decay_us"} <= set(names)
+    np.testing.assert_allclose(np.diag(matrix), 1, atol=1e-3)
+    np.testing.assert_allclose(matrix, matrix.T)
+    assert np.abs(matrix).max() <= 1.001
+    assert all(whole["numbers"][name]["error"] > 0 for name in names)
+    # what comes late is not there early
+    late, later = (names.index(f"missing_{ns}_ns") for ns in (500, 1000))
+    assert matrix[late, later] > 0.5

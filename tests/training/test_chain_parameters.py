@@ -7,7 +7,7 @@ import pytest
 
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.chain_fit import Parabola, minimum
-from cpunet.training.chain_parameters import Parameters, SmoothParameters
+from cpunet.training.chain_parameters import SmoothParameters, vector_of
 from synthetic import load_recipe
 
 DT_NS = 16.0
@@ -22,10 +22,18 @@ def response(poles_ns: tuple[float, float], slow: float) -> ElectronicsResponse:
     return made
 
 
+def put(response: ElectronicsResponse, vector: np.ndarray) -> None:
+    """Set the parameters themselves."""
+    parts = [*response.parameters.values()]
+    stops = np.cumsum([len(part) for part in parts])[:-1]
+    for part, values in zip(parts, np.split(vector, stops), strict=True):
+        part[:] = values
+
+
 def test_coordinates_are_those_of_the_poles_and_back() -> None:
     made = response((60.0, 40.0), 0.05)
-    smooth, plain = SmoothParameters(made), Parameters(made)
-    place, vector = smooth.vector(), plain.vector()
+    smooth = SmoothParameters(made)
+    place, vector = smooth.vector(), vector_of(made)
     np.testing.assert_allclose(place[0], np.log(2400) / 2)
     np.testing.assert_allclose(place[1], (np.log(1.5) / 2) ** 2)
     smooth.set(place - np.eye(len(place))[1])  # below 0 there are no real poles
@@ -35,30 +43,32 @@ def test_coordinates_are_those_of_the_poles_and_back() -> None:
     # derivatives of the coordinates with the parameters
     slopes = []
     for step in 1e-6 * np.eye(len(vector)):
-        plain.set(vector + step)
+        put(made, vector + step)
         slopes.append((smooth.vector() - place) / 1e-6)
-    plain.set(vector)
+    put(made, vector)
     known = np.diag([1e4, 1e6, 1e4, 1e6, 1e2])
     by_parameters = np.array(slopes) @ known @ np.transpose(slopes)
-    covariance = np.linalg.inv(by_parameters + np.diag(plain.widths**-2.0))
+    covariance = np.linalg.inv(
+        by_parameters + np.diag(SmoothParameters(made, poles=False).widths ** -2.0)
+    )
     np.testing.assert_allclose(smooth.covariance(known), covariance, rtol=1e-4, atol=1e-9)
 
 
 def test_coordinates_are_those_of_the_decays_and_back() -> None:
     made = ElectronicsResponse(load_recipe("fast").matching[0], DT_NS)
-    smooth, plain = SmoothParameters(made, poles=False), Parameters(made)
-    decay = plain.labels.index("log_decay_us")
-    vector = plain.vector()
+    smooth = SmoothParameters(made, poles=False)
+    decay = smooth.labels.index("log_decay_us")
+    vector = vector_of(made)
     vector[decay] += np.log(0.8)
     vector[-2:] = 0.05, -0.02
-    plain.set(vector)
+    put(made, vector)
     place = smooth.vector()
     assert place[decay] == pytest.approx(0.97 * 0.25)
     smooth.set(place)
-    np.testing.assert_allclose(plain.vector(), vector, rtol=1e-12)
+    np.testing.assert_allclose(vector_of(made), vector, rtol=1e-12)
     steps = 1e-6 * np.eye(len(vector))
-    moved = [plain.set(vector + step) or smooth.vector() for step in steps]
-    plain.set(vector)
+    moved = [put(made, vector + step) or smooth.vector() for step in steps]
+    put(made, vector)
     np.testing.assert_allclose(smooth.turn().T, (np.array(moved) - place) / 1e-6, atol=1e-5)
 
 

@@ -76,6 +76,9 @@ def test_a_training_that_died_leaves_its_checkpoint_until_it_is_finished(tmp_pat
     caplog.set_level("INFO", "cpunet")
     out, folder = tmp_path / "run", tmp_path / "run.unfinished"
     with pytest.raises(Interrupted):
+        dying(out, checkpoint=False)
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(Interrupted):
         dying(out, checkpoint=True)
     left = {p.name: p.read_bytes() for p in folder.iterdir()}
     assert left.keys() == {CHECKPOINT, outputs.MARKER}
@@ -110,9 +113,3 @@ def test_a_full_disk_does_not_stop_the_training(tmp_path, caplog):
     assert note.startswith(f"{tmp_path}: no checkpoint after 7 iterations (")
     assert note.endswith("; the previous remains")
     assert str(UnfinishedRun(tmp_path, FACTS).begin(resume=True)) == str(state(1.0))
-
-
-def test_what_never_had_a_checkpoint_leaves_nothing(tmp_path):
-    with pytest.raises(Interrupted):
-        dying(tmp_path / "run", checkpoint=False)
-    assert list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -14,10 +15,11 @@ from cpunet.networks.response_layer import (
     deviation_lags,
     padding,
 )
+from cpunet.training.aligned import Basis, Derivatives
+from cpunet.training.bands import Sides
 from cpunet.training.chain_parameters import with_settings
-from cpunet.training.closed_forms import learned_chain, reaches_ns, true_chain_of
-from cpunet.training.comparison import Comparison, Sides
-from cpunet.training.derivatives import Basis
+from cpunet.training.closed_forms import TIMES_NS, learned_chain, reaches_ns, true_chain_of
+from cpunet.training.comparison import Comparison
 from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.verdict import PARTS, Verdict, verdict
@@ -81,7 +83,7 @@ def test_derivatives_are_those_of_differences(plain, at_ns):
         Comparison(sides, deviating(response, size * change).transfer(sides.padded), 6.0)
         for size in (0.0, step, -step)
     )
-    found = found.differences(basis)
+    found = found.differences(partial(Derivatives, basis))
     ends = [end.differences() for end in ends]
     for here, up, down in zip(found[2:], ends[0][2:], ends[1][2:], strict=True):
         wanted = (up.values - down.values) / (2 * step)
@@ -114,7 +116,7 @@ def test_a_ringing_is_learned_and_its_lack_is_bad(rings):
         true_chain_of(RINGS),
         true_chain_of(CHAIN),
     ):
-        half_ns = reaches_ns(chain, 0.5)
+        half_ns = reaches_ns(chain.step(TIMES_NS), 0.5)
         steps.append(chain.step(time_ns + half_ns) / chain.step(3000.0))
     assert np.abs(steps[0] - steps[1]).max() < 0.002
     assert np.abs(steps[2] - steps[1]).max() > 0.008

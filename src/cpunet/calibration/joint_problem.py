@@ -18,10 +18,10 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
+from cpunet.training.aligned import Basis
 from cpunet.training.chain_fit import Parabola, minimum
 from cpunet.training.chain_parameters import SmoothParameters
 from cpunet.training.comparison import NONE, Difference
-from cpunet.training.derivatives import Basis
 from cpunet.training.joint import SHRUNK
 
 # Residual that keeps a step within the reach of the derivatives: its size at the reach.
@@ -295,4 +295,4 @@ def events(functions: Sequence[SlicedJoint]) -> int:
 def first(functions: Sequence[SlicedJoint], most: int = FOR_DERIVATIVES) -> list[SlicedJoint]:
     """Functions of the first events, sufficient for derivatives, with some of each band."""
     most = max(most, *(int(np.sort(band.sides.rows)[:OF_BAND][-1]) + 1 for band in functions))
-    return [band.of_events(band.sides.rows < most) for band in functions]
+    return [band.with_sides(band.sides.of_events(band.sides.rows < most)) for band in functions]

@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from cpunet.training.aligned import Aligned, Floats, Values
-from cpunet.training.comparison import Sides
+from cpunet.training.bands import Sides
 from cpunet.training.joint import SEGMENTS, Joint, gaussian_bins
 
 # Bins of the drift time, its slices, and bins of the current amplitude in each: number (half as

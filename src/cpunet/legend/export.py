@@ -30,7 +30,7 @@ from cpunet.progress import stage
 from cpunet.settings import plain, yaml_text
 from cpunet.training.chain_description import describe_chain
 from cpunet.training.closed_forms import StepResponse
-from cpunet.training.response_tables import as_csv, as_yaml
+from cpunet.training.response import as_csv, as_yaml
 from cpunet.training.run import RunLike, as_run
 from cpunet.validation.report import METRICS, read_metrics
 

@@ -20,20 +20,20 @@ import logging
 import math
 import signal
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad, softplus
+from torch.nn.utils import clip_grad_norm_
+from torch.optim import AdamW
 
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import GruDiscriminator, PositionalUNet
 from cpunet.recipes import schema
-from cpunet.training.judging import JUDGED, Judge
-from cpunet.training.optimisers import Optimisers
 from cpunet.training.run import Record
-from cpunet.training.sides import Sides
 from cpunet.training.unfinished import State, waiting_signals
-from cpunet.training.views import View, half_sample
+from cpunet.training.views import WON, Judge, Sides, View, half_sample
 
 log = logging.getLogger(__name__)
 
@@ -41,6 +41,7 @@ SIZE, FAST_NS, AROUND_NS = 0.1, 128.0, 2048.0  # of a change by U, its current, 
 SLOPE, SHARP, TOP = 0.2, 4.0, 6.0  # of the critic
 TOLERATED = 3.0  # deviation of a cycle that is ignored, in RMS of the pulse's own baseline
 SOME, PROBE, LAZY = 4000, 0.01, 4  # pulses of a view; step, and interval, of a GRU's penalty
+JUDGED = 5  # iterations between judgements of critics
 
 
 class Residual(nn.Module):
@@ -155,10 +156,10 @@ class Game:
     ) -> None:
         self.ren, self.iren, self.sides, self.config = ren, iren, sides, settings.training
         c, critic, device = settings.training, settings.discriminator, sides.data.pulses.device
-        self.weights = window_weights(c.losses, sides.preparation.length).to(device)
+        own, gru = sides.preparation, isinstance(critic, schema.GruConfig)
+        self.weights = window_weights(c.losses, own.length).to(device)
         some = self.with_noise(sides.sim.draw(min(SOME, 4 * sides.sim.seen)))
-        real, own = {"data": sides.data.pulses[: sides.data.seen]}, sides.preparation
-        real["sim"] = some
+        real = {"data": sides.data.pulses[: sides.data.seen], "sim": some}
         with torch.no_grad():
             self.views = {side: View(side, those, critic, own) for side, those in real.items()}
         critics = {
@@ -171,26 +172,36 @@ class Game:
         self.generators = nn.ModuleDict({"ren": ren, "iren": iren}).to(device).train()
         self.average = copy.deepcopy(self.generators).requires_grad_(False)
         self.good = copy.deepcopy(self.average)  # when the critic of the data had not won
-        self.optimisers = Optimisers(self.generators, self.critics, c)
-        unseen = min(len(side.pulses) - side.seen for side in (sides.sim, sides.data))
-        self.judge = Judge([*real], unseen)
-        self.lazy = LAZY if isinstance(critic, schema.GruConfig) else 1
-        self.iteration, self.rate, self.right = 0, 0.0, dict[str, float]()
-        names = "generators", "critics", "average", "good", "optimisers", "judge"
-        self.parts = {name: getattr(self, name) for name in names}  # which a state is of
+        how: Any = {"betas": c.betas, "weight_decay": c.weight_decay}
+        named, own_rate = [*self.generators.named_parameters()], c.rate_discriminators
+        groups = [
+            {"params": [p for name, p in named if part in name], "rate": rate}
+            for part, rate in ((".unet.", c.rate_generators), (".linear.", c.rate_linear))
+        ]
+        self.optimisers = {"pair": AdamW(groups, **how)} | {
+            side: AdamW([{"params": [*network.parameters()], "rate": own_rate}], **how)
+            for side, network in self.critics.items()
+        }
+        unseen = min(len(side.pulses) - side.seen for side in sides[:2])
+        self.judge, self.lazy = Judge([*real], unseen), LAZY if gru else 1
+        self.iteration = 0
+        names = "generators", "critics", "average", "good"
+        self.parts: dict[str, Any] = {name: getattr(self, name) for name in names}
+        self.parts |= self.optimisers  # which a state is of
 
     def state(self) -> State:
         """All that the next iterations depend on, except pulses and settings."""
         return {
             "iteration": self.iteration,
-            "right": dict(self.right),
+            "judge": copy.deepcopy(vars(self.judge)),
             "random": [torch.get_rng_state(), *torch.cuda.get_rng_state_all()],
             "parts": {name: part.state_dict() for name, part in self.parts.items()},
         }
 
     def restore(self, state: State) -> None:
         """Continue from a state of the same pulses and settings."""
-        self.iteration, self.right = state["iteration"], dict(state["right"])
+        self.iteration = state["iteration"]
+        vars(self.judge).update(copy.deepcopy(state["judge"]))
         for name, part in self.parts.items():
             part.load_state_dict(state["parts"][name])
         torch.set_rng_state(state["random"][0])
@@ -213,7 +224,12 @@ class Game:
         rows, y, losses = sim.draw(c.batch_size), data.draw(c.batch_size), dict[str, Tensor]()
         y, w, prepared = data.pulses[y], self.weights, self.sides.prepared
         full = self.iteration % c.cycle_interval == 0
-        self.rate = self.optimisers.set_rates(self.iteration)
+        rise = (self.iteration + 1) / max(1, c.warmup)
+        left = min(1.0, (c.iterations - self.iteration) / max(1, c.iterations - c.decay_start))
+        for name, optimiser in self.optimisers.items():
+            fall = max(left**c.decay_power, c.least_rate if name in self.critics else 0.0)
+            for group in optimiser.param_groups:
+                group["lr"] = group["rate"] * min(1.0, rise, fall)
         if full or "data" not in self.judge.over:
             fake = self.sides.noisy(ren(sim.pulses[rows]), rows)  # (n, samples with room)
             losses |= self.play("data", "ren", y, fake)
@@ -221,13 +237,22 @@ class Game:
             rows, y, fake = rows[: c.cycle_size], y[: c.cycle_size], fake[: c.cycle_size]
             x, back = sim.pulses[rows], iren(y)
             losses |= self.play("sim", "iren", self.with_noise(rows), back)
-            noise = TOLERATED * self.sides.tolerance(y)
+            rms = y[:, : self.sides.preparation.baseline_samples].std(dim=1, keepdim=True)
+            noise = TOLERATED * rms * (self.sides.noise is not None)  # no generator makes it
             losses["cycle_forward"] = weighted_l1(iren(prepared(fake)) - x, w)
             losses["cycle_backward"] = weighted_l1(prepared(ren(back)) - y, w, noise)
             losses["identity_data"] = weighted_l1(ren.change(y), w)
             losses["identity_sim"] = weighted_l1(iren.change(x), w)
         if losses:
-            self.improve(losses)
+            kinds = ((name.partition("_")[0], loss) for name, loss in losses.items())
+            weight = c.losses.model_dump()
+            total = sum(weight[f"{k}_weight"] * a for k, a in kinds if k != "discriminator")
+            self.follow(total, "pair")
+            keep = min(c.average, (1 + self.iteration) / (10 + self.iteration))
+            own, averages = (net.state_dict() for net in (self.generators, self.average))
+            for name, value in averages.items():
+                new = own[name]
+                value.copy_(new.lerp(value, keep) if value.is_floating_point() else new)
         self.iteration += 1
         return {name: float(loss.detach()) for name, loss in losses.items()}
 
@@ -243,8 +268,8 @@ class Game:
             losses[f"discriminator_{side}"] = loss = adversarial_loss(better, worse, c.paired)
             if c.penalty and self.iteration % self.lazy == 0:
                 loss = loss + self.lazy * c.penalty * slopes_squared(critic, both)
-            self.optimisers.follow(loss, side)
-            self.right[side] = float((better > worse).float().mean())
+            self.follow(loss, side)
+            self.judge.right[side] = float((better > worse).float().mean())
         critic.requires_grad_(False)
         if isinstance(critic, GruDiscriminator):
             critic.norm.eval()  # not the GRU: cuDNN's has no backward pass in evaluation
@@ -252,22 +277,19 @@ class Game:
         losses[f"adversarial_{part}"] = adversarial_loss(judged, by, c.paired)
         return losses
 
-    def improve(self, losses: dict[str, Tensor]) -> None:
-        """Move the generators by their six losses, and the average after them."""
-        kinds = ((name.partition("_")[0], loss) for name, loss in losses.items())
-        weight = self.config.losses.model_dump()
-        total = sum(weight[f"{k}_weight"] * loss for k, loss in kinds if k != "discriminator")
-        self.optimisers.follow(total, "unet", "linear")
-        keep = min(self.config.average, (1 + self.iteration) / (10 + self.iteration))
-        own, averages = (net.state_dict() for net in (self.generators, self.average))
-        for name, value in averages.items():
-            new = own[name]
-            value.copy_(new.lerp(value, keep) if value.is_floating_point() else new)
+    def follow(self, loss: Any, name: str) -> None:
+        """Move a critic, or the pair of generators, down the slope of a loss."""
+        optimiser = self.optimisers[name]
+        optimiser.zero_grad()
+        loss.backward()
+        for group in optimiser.param_groups:
+            clip_grad_norm_(group["params"], self.config.max_grad_norm)
+        optimiser.step()
 
     @torch.no_grad()
     def judged(self) -> dict[str, float]:
         """Part of pairs that critics order rightly: of the training, and of unseen pulses."""
-        results, n = dict(self.right), self.config.batch_size
+        results, n = dict(self.judge.right), self.config.batch_size
         if not self.judge.unseen:
             return results
         rows, others = (side.draw(n, unseen=True) for side in self.sides[:2])
@@ -279,16 +301,10 @@ class Game:
         for side, pair in pairs.items():
             real, fake = (self.critics[side](self.views[side](pulses)) for pulses in pair)
             results[f"{side}_unseen"] = right = float((real > fake).float().mean())
-            self.judge.add(side, right, self.iteration / self.config.iterations)
-        if self.judge.good("data"):
-            self.good.load_state_dict(self.average.state_dict())
+            mean = self.judge.note(side, right, self.iteration / self.config.iterations)
+            if side == "data" and mean <= WON:
+                self.good.load_state_dict(self.average.state_dict())
         return results
-
-    def averaged(self, part: str) -> Generator:
-        """The average of ``"ren"`` or ``"iren"``, for use."""
-        network = self.average[part]
-        assert isinstance(network, Generator)
-        return network.eval()
 
 
 def train(
@@ -312,9 +328,11 @@ def train(
         if start is not None:
             game.restore(start)
         c = game.config
-        while game.iteration < c.iterations and not game.judge.ended:
+        over = game.judge.over
+        while game.iteration < c.iterations and over.get("data") != "won" and len(over) < 2:
             losses, done = game.step(), game.iteration
-            records.append({"iteration": done - 1, "rate": game.rate, "losses": losses})
+            rate = game.optimisers["pair"].param_groups[0]["lr"]
+            records.append({"iteration": done - 1, "rate": rate, "losses": losses})
             stop = bool(waiting) and done < c.iterations
             keep = stop or done == c.iterations or done % c.checkpoint_interval == 0
             if done % JUDGED == 0:
@@ -337,4 +355,5 @@ def train(
             listener(records)
     if game.judge.over.get("data") == "won":
         game.average.load_state_dict(game.good.state_dict())
+    game.average.eval()
     return game

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,17 +18,16 @@ from cpunet.pulses.loading import SideInfo
 from cpunet.recipes.schema import ResponseConfig
 from cpunet.tables import counted, percent, with_std
 from cpunet.training.closed_forms import (
+    TIMES_NS,
     Chain,
     Numbers,
     chain_numbers,
     learned_chain,
     moved_along_axes,
-    noise_numbers,
     reaches_ns,
     slow_numbers,
     with_noise,
 )
-from cpunet.training.diagnosis import beyond, stretched
 from cpunet.training.run import Run
 from cpunet.training.verdict import FitInfo
 
@@ -37,6 +37,13 @@ PARTS = re.compile(r"slow_|decay_|fast_decay_")
 # The parts of a chain that deviates are not what its step response consists of.
 HIDDEN = ("slow_", "pole_", "decay_", "ringing", "sharpness")
 _LONG_DRIFT_NS = 1000.0  # maximum lead of a slowly drifting charge over a prompt charge
+# Limits of the fraction of charge that arrives late; an overshoot makes it a few percent
+# negative.
+MAX_NEGATIVE, MAX_SLOW = -0.25, 0.5
+DRIFT = {1: "drift-time scale", 2: "its change with time"}  # by number of terms
+WORST = 8  # maximum number of deviating moments of a fit
+UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}
+_FAR = 3.0  # standard deviations
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +98,8 @@ def describe_chain(run: Run) -> DescribedChain:
         chain = with_noise(chain, network, preparation)
     parameters = response.describe()
 
-    def derived(moved: ElectronicsResponse) -> Numbers:
-        numbers = chain_numbers(learned_chain(moved, ""), preparation, run.dt_ns)
+    def derived(moved: ElectronicsResponse, own: Chain | None = None) -> Numbers:
+        numbers = chain_numbers(own or learned_chain(moved, ""), preparation, run.dt_ns)
         if moved.config.deviations:
             return numbers
         slow = list(zip(moved.slow_ns.tolist(), moved.slow_weights.tolist(), strict=True))
@@ -100,7 +107,7 @@ def describe_chain(run: Run) -> DescribedChain:
 
     hidden = "slow_" if "deviation" not in parameters else HIDDEN
     values = {n: v for n, v in parameters.items() if not n.startswith(hidden)}
-    values |= derived(response) | noise_numbers(chain)
+    values |= derived(response, chain)
     if fit.chi_square_per_moment is not None:
         values["chi_square_per_moment"] = fit.chi_square_per_moment
     errors = {  # of the fit; those of times are of their logarithms
@@ -114,7 +121,8 @@ def describe_chain(run: Run) -> DescribedChain:
     error, rms = fit.noise.get("rms_error"), fit.noise.get("rms")
     if error and rms and chain.noise is not None:
         # of the baselines, and of the height of a full charge
-        end_ns = reaches_ns(chain, preparation.align_fraction) + preparation.after_ns
+        aligned_ns = reaches_ns(chain.step(TIMES_NS), preparation.align_fraction)
+        end_ns = aligned_ns + preparation.after_ns
         sooner, at_once = (float(chain.step(end_ns + t)) for t in (_LONG_DRIFT_NS, 0.0))
         relative = float(np.hypot(error / rms, sooner / at_once - 1))
         of_values["noise_rms_kev"] = values["noise_rms_kev"] * relative
@@ -127,9 +135,61 @@ def describe_chain(run: Run) -> DescribedChain:
     return DescribedChain(run, chain, values, of_values, parameters, errors, doubts, moved)
 
 
-WORST = 8  # maximum number of deviating moments of a fit
-UNITS = {"ns": "ns", "us": "µs", "mhz": "MHz", "kev": "keV"}
-_FAR = 3.0  # standard deviations
+def beyond(parameters: Mapping[str, float]) -> list[str]:
+    """Properties of a fitted chain that no readout has, in words.
+
+    Parameters
+    ----------
+    parameters
+        Parameters from `ElectronicsResponse.describe`.
+
+    Examples
+    --------
+    >>> beyond({"pole_1_ns": 40.0, "slow_100_ns": -0.5, "slow_400_ns": -0.2})
+    ['70 % of the charge would arrive too early, which electronics cannot cause; see the fit']
+    """
+    if "deviation" in parameters:  # the parts of its chain are not what it consists of
+        return []
+    slow = sum(value for name, value in parameters.items() if name.startswith("slow_"))
+    if MAX_NEGATIVE <= slow <= MAX_SLOW:
+        return []
+    how = "late, as of slower pulses than simulated"
+    if slow < 0:
+        how = "too early, which electronics cannot cause"
+    return [f"{100 * abs(slow):.0f} % of the charge would arrive {how}; see the fit"]
+
+
+def stretched(parameters: Mapping[str, float], gains: Mapping[str, str] = {}) -> list[str]:
+    """Say in words that the simulated drift was stretched, if it was, and what that may mean.
+
+    Parameters
+    ----------
+    parameters
+        Parameters from `ElectronicsResponse.describe`.
+    gains
+        What held-out pulses say of each part that was tried.
+
+    Examples
+    --------
+    >>> print(stretched({"drift_stretch": 0.052})[0])
+    charges drift for 5.2 % longer than simulated, as in a warmer detector, at a lower bias or \
+with other impurities: cpunet calibrate tells which
+    """
+    if (stretch := parameters.get("drift_stretch")) is None:
+        return []
+    change = parameters.get("drift_stretch_per_us", 0.0)
+    late, early = (
+        f"{100 * abs(of):.1f} % {'longer' if of > 0 else 'shorter'}"
+        for of in (stretch, stretch + change)
+    )
+    size = f"charges drift for {early} than simulated"
+    if change:
+        size += f" in the last microsecond, {late} near its end"
+    if (gain := gains.get(DRIFT[1], "").partition("; ")[2]) != "":
+        size += f" ({gain})"
+    how = ("warmer", "a lower") if stretch > 0 else ("colder", "a higher")
+    cause = "{} detector, at {} bias".format(*how)
+    return [f"{size}, as in a {cause} or with other impurities: cpunet calibrate tells which"]
 
 
 def summary(run: Run) -> list[tuple[str, str]]:
@@ -137,23 +197,18 @@ def summary(run: Run) -> list[tuple[str, str]]:
     fit, where = run.fit or FitInfo(), run.name
     worst = sorted(fit.pulls, key=lambda name: -abs(fit.pulls[name]))[:WORST]
     off = (f"{name} {fit.pulls[name]:+.1f} σ" for name in worst if abs(fit.pulls[name]) > _FAR)
-    delay = (
-        f"{fit.delay_ns:.1f} ns, half rise of a step; translated pulses have it taken off t0"
-    )
+    when = f"{run.started[:16].replace('T', ' ')}, {run.seconds:.4g} s on {run.device}"
+    taken = "ns, half rise of a step; translated pulses have it taken off t0"
     lines = [
         ("run", where),
-        (
-            "trained",
-            f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; "
-            f"{run.started[:16].replace('T', ' ')}, {run.seconds:.4g} s on {run.device}",
-        ),
+        ("trained", f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; {when}"),
         ("simulated", _side(run.sim)),
         ("measured", _side(run.data)),
         ("fit", fit.verdict),
         ("off", ", ".join(off)),
         *(("cause", cause) for cause in fit.causes),
         ("response", ", ".join(_parameter(*item) for item in fit.parameters.items())),
-        ("delay", f"{fit.delay_ns:.1f} ns, {delay}" if fit.delay_ns else ""),
+        ("delay", f"{fit.delay_ns:.1f} {taken}" if fit.delay_ns else ""),
     ]
     if "baselines" in fit.noise:
         size = ""

@@ -18,7 +18,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,8 +26,9 @@ from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.aligned import Values
+from cpunet.training.bands import Sides
 from cpunet.training.chain_parameters import SmoothParameters
-from cpunet.training.comparison import Comparison, Difference, Sides
+from cpunet.training.comparison import Comparison, Difference
 from cpunet.training.joint import Joint, SingleSites
 
 WIDER = (16.0, 4.0)  # functions with which the valley is searched
@@ -40,8 +41,6 @@ DAMPING, MORE, TRIES = 0.03, 8.0, 5
 # Chi-square per function above which a fit has missed its valley, or has none.
 POOR = 5.0
 SLOW = 0.03  # share by which a step must lower a chi-square that is as poor as that
-
-Listener = Callable[[int, float], None]
 
 
 @dataclass(eq=False)
@@ -61,15 +60,14 @@ class Fitter:
     """
 
     training: MatchingConfig
-    listener: Listener | None = None
+    listener: Callable[[int, float], None] = lambda *_: None
     steps: int = 0
     gains: dict[str, str] = field(default_factory=dict)
 
     def count(self, chi_square: float) -> None:
         """Count a step, and report it."""
         self.steps += 1
-        if self.listener is not None:
-            self.listener(self.steps, chi_square)
+        self.listener(self.steps, chi_square)
 
 
 class Fitted(NamedTuple):
@@ -187,21 +185,8 @@ class Parabola(NamedTuple):
     gradient: Values
 
 
-class Unknowns(Protocol):
-    """Coordinates with the widths of their priors, longest steps, and bounds."""
-
-    widths: Values
-    longest: Values
-    low: Values
-    high: Values
-
-    def vector(self) -> Values: ...
-
-    def set(self, vector: Values) -> None: ...
-
-
 def minimum(
-    unknowns: Unknowns,
+    unknowns: Any,
     evaluate: Callable[[Values], Parabola],
     steps: int,
     fall: float,
@@ -212,7 +197,8 @@ def minimum(
     Parameters
     ----------
     unknowns
-        Coordinates, at the start.
+        Coordinates at the start, with the widths of their priors, longest steps, and bounds:
+        `SmoothParameters`, or the like.
     evaluate
         Chi-square about a place, to which it sets the coordinates.
     steps

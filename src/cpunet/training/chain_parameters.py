@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 import scipy.fft
 
-from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, deviation_lags
+from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
 from cpunet.pulses.container import FloatArray
-from cpunet.training.aligned import Values
-from cpunet.training.derivatives import Basis
+from cpunet.training.aligned import Basis, Values
 
 POLES, DECAY, DECAY_WEIGHTS = "log_poles_ns", "log_decay_us", "decay_weights"
 # Widths of the priors around the start: wide for times (in their logarithm).
@@ -27,93 +25,12 @@ SCALES = {DECAY_WEIGHTS: 0.03, "slow_weights": 0.1, "sharpness": 0.5}
 STEP, STRETCHED = 1e-5, 0.004
 
 
-class Parameters:
-    """The parameters of a response as a vector, with their priors.
-
-    Parameters
-    ----------
-    response
-        Response with the parameters; their current values are the centres of the priors.
-    """
-
-    response: ElectronicsResponse
-
-    def __init__(self, response: ElectronicsResponse) -> None:
-        self.response = response
-        named = response.parameters.items()
-        self.labels = [n for n, p in named for _ in p]
-        self._names = [f"{n}.{i}" for n, p in named for i in range(1, len(p) + 1)]
-        self.centre = self.vector()
-        self.widths = np.array([SCALES.get(name, TIME_WIDTH) for name in self.labels])
-        self.longest = self.widths.copy()
-        self.low = np.full(len(self.centre), -np.inf)
-        self.high = -self.low
-        of_samples = [label == "sharpness" for label in self.labels]
-        self.low[of_samples], self.high[of_samples] = 0.0, 1.0  # from means to points
-        stretched = [label == STRETCH for label in self.labels]
-        self.widths[stretched] = STRETCH_WIDTHS[: sum(stretched)]
-
-    def vector(self) -> Values:
-        """Parameters as a vector."""
-        return np.concatenate([*self.response.parameters.values()])
-
-    def set(self, vector: Values) -> None:
-        """Set the parameters of the response from a vector."""
-        first = 0
-        for part in self.response.parameters.values():
-            part[:] = vector[first : first + len(part)]
-            first += len(part)
-
-    def slopes_of_transfer(self, padded: int) -> list[tuple[float, Spectrum]]:
-        """Widths of all parameters but a stretch, and how the spectrum changes with each."""
-        slopes: list[tuple[float, Spectrum]] = []
-        for i, label in enumerate(self.labels):
-            if label == STRETCH:
-                continue
-            here, step, spectra = self.vector(), STEP * self.widths[i], []
-            low, high = max(here[i] - step, self.low[i]), here[i] + step
-            for end in (low, high):
-                moved = here.copy()
-                moved[i] = end
-                self.set(moved)
-                spectra.append(self.response.transfer(padded))
-            self.set(here)
-            change = (spectra[1] - spectra[0]) / (high - low)
-            slopes.append((float(self.widths[i]), change))
-        return slopes
-
-    def basis(self, padded: int) -> Basis:
-        """Changes of the step response with each parameter but a stretch."""
-        lags = deviation_lags(float(self.response.dt_ns))
-        changes = np.array([change for _, change in self.slopes_of_transfer(padded)])
-        steps = scipy.fft.irfft(changes, padded)
-        return Basis(int(lags[0]), np.ascontiguousarray(steps[:, lags].T))
-
-    def changes(self, sim: FloatArray) -> list[FloatArray]:
-        """Changes of simulated pulses with each term of a stretch, the last parameters."""
-        clock, changes = self.response.drift, list[FloatArray]()
-        for i in range(0 if clock is None else len(clock.stretch)):
-            ends = []
-            for sign in (-1, 1):
-                moved = copy.deepcopy(self.response)
-                assert moved.drift is not None
-                moved.drift.stretch[i] += sign * STRETCHED
-                ends.append(moved.drifted(sim))
-            change = (ends[1] - ends[0]) / (2 * STRETCHED)
-            changes.append(np.asarray(change, np.float32))
-        return changes
-
-    def by_name(self, values: Values) -> dict[str, float]:
-        """Values of the parameters by name and number."""
-        return dict(zip(self._names, values.tolist(), strict=True))
-
-
 SLOWEST = -0.99  # rate of the slowest decay: a hundred times slower than at the start
 SQUARE_WIDTH = 0.25  # of the prior for the square of half the difference of two logarithms
 
 
-class SmoothParameters(Parameters):
-    r"""The parameters in coordinates on which pulses depend nearly linearly.
+class SmoothParameters:
+    r"""The parameters with their priors, in coordinates on which pulses depend nearly linearly.
 
     Two poles act alike: pulses depend on the mean of their logarithms and on the *square* of
     their difference, and each pair is replaced by these.  Where two poles are equal,
@@ -136,10 +53,14 @@ class SmoothParameters(Parameters):
         on the current ones.  Its decay is :math:`\tau_0`.
     poles
         Whether the poles are replaced, too.
-    """
 
-    _pairs: Sequence[tuple[int, int]] = ()
-    _decay: int | None = None
+    Attributes
+    ----------
+    labels
+        Name of each parameter, without its number.
+    centre, widths, longest, low, high
+        Centres and widths of the priors, longest steps, and bounds.
+    """
 
     def __init__(
         self,
@@ -148,38 +69,57 @@ class SmoothParameters(Parameters):
         *,
         poles: bool = True,
     ) -> None:
-        super().__init__(response)
-        given = {} if start is None else (own := Parameters(start)).by_name(own.centre)
-        current = self.by_name(self.centre)
+        self.response = response
+        given = {} if start is None else by_name(start, vector_of(start))
+        current = by_name(response, vector_of(response))
         centre = np.array([given.get(name, value) for name, value in current.items()])
-        of_poles = [i for i, label in enumerate(self.labels) if poles and label == POLES]
-        self._pairs = list(zip(of_poles[::2], of_poles[1::2], strict=False))
+        self.labels = [name.rpartition(".")[0] for name in current]
+        named = np.array(self.labels)
+        self.widths = np.array([SCALES.get(name, TIME_WIDTH) for name in self.labels])
+        self.longest = self.widths.copy()
+        self.low = np.full(len(centre), -np.inf)
+        self.high = -self.low
+        self.low[named == "sharpness"] = 0.0  # from means to points
+        self.high[named == "sharpness"] = 1.0
+        stretched = named == STRETCH
+        self.widths[stretched] = STRETCH_WIDTHS[: stretched.sum()]
         self._plain_widths = self.widths.copy()
+        of_poles = np.flatnonzero(named == POLES).tolist() if poles else []
+        self._pairs = list(zip(of_poles[::2], of_poles[1::2], strict=False))
         for mean, square in self._pairs:
             self.widths[mean] /= np.sqrt(2)
             self.widths[square] = self.longest[square] = SQUARE_WIDTH
             self.low[square] = 0.0
-        self._shares = np.array([label == DECAY_WEIGHTS for label in self.labels])
-        if DECAY in self.labels:
-            self._decay = self.labels.index(DECAY)
-            self._log_reference = centre[self._decay]
-            self.low[self._decay] = SLOWEST
+        self._shares, self._decay = named == DECAY_WEIGHTS, self.labels.index(DECAY)
+        self._log_reference = centre[self._decay]
+        self.low[self._decay] = SLOWEST
         self.centre = self._of(centre)
+
+    def _of(self, plain: Values) -> Values:
+        """Coordinates of a vector of parameters."""
+        place, i = plain.copy(), self._decay
+        for mean, square in self._pairs:
+            first, second = plain[mean], plain[square]
+            place[mean], place[square] = 0.5 * (first + second), 0.25 * (first - second) ** 2
+        rate = np.expm1(self._log_reference - plain[i])
+        place[i] = float(1 - plain[self._shares].sum()) * rate
+        return place
 
     def vector(self) -> Values:
         """Coordinates of the current response."""
-        return self._of(super().vector())
+        return self._of(vector_of(self.response))
 
     def set(self, vector: Values) -> None:
         """Set the response from its coordinates."""
-        plain = vector.copy()
+        plain, i, first = vector.copy(), self._decay, 0
         for mean, square in self._pairs:
             half = np.sqrt(max(vector[square], 0.0))
             plain[mean], plain[square] = vector[mean] + half, vector[mean] - half
-        if (i := self._decay) is not None:
-            rate = 1 + vector[i] / self._main_share(vector)
-            plain[i] = self._log_reference - np.log(max(rate, 1 + SLOWEST))
-        super().set(plain)
+        rate = 1 + vector[i] / float(1 - vector[self._shares].sum())
+        plain[i] = self._log_reference - np.log(max(rate, 1 + SLOWEST))
+        for part in self.response.parameters.values():
+            part[:] = plain[first : first + len(part)]
+            first += len(part)
 
     def covariance(self, information: Values) -> Values:
         """Covariance of the parameters themselves, which have priors of their own.
@@ -196,32 +136,59 @@ class SmoothParameters(Parameters):
 
     def turn(self) -> Values:
         """Derivatives of the coordinates in the parameters themselves, here."""
-        here = self.vector()
+        here, i = self.vector(), self._decay
         turn = np.eye(len(here))
         for mean, square in self._pairs:
             half = np.sqrt(max(here[square], 0.0))
             turn[mean, [mean, square]] = 0.5
             turn[square, [mean, square]] = half, -half
-        if (i := self._decay) is not None:
-            share = self._main_share(here)
-            turn[i, self._shares] = -here[i] / share
-            turn[i, i] = -(share + here[i])
+        share = float(1 - here[self._shares].sum())
+        turn[i, self._shares] = -here[i] / share
+        turn[i, i] = -(share + here[i])
         return turn
 
-    def _of(self, plain: Values) -> Values:
-        """Coordinates of a vector of parameters."""
-        place = plain.copy()
-        for mean, square in self._pairs:
-            first, second = plain[mean], plain[square]
-            place[mean], place[square] = 0.5 * (first + second), 0.25 * (first - second) ** 2
-        if (i := self._decay) is not None:
-            rate = np.expm1(self._log_reference - plain[i])
-            place[i] = self._main_share(plain) * rate
-        return place
+    def basis(self, padded: int) -> Basis:
+        """Changes of the step response with each parameter but those of a stretch."""
+        changes = []
+        for i in range(len(self.labels) - self.labels.count(STRETCH)):
+            here, step, spectra = self.vector(), STEP * self.widths[i], []
+            low, high = max(here[i] - step, self.low[i]), here[i] + step
+            for end in (low, high):
+                moved = here.copy()
+                moved[i] = end
+                self.set(moved)
+                spectra.append(self.response.transfer(padded))
+            self.set(here)
+            changes.append((spectra[1] - spectra[0]) / (high - low))
+        lags = deviation_lags(float(self.response.dt_ns))
+        steps = scipy.fft.irfft(np.array(changes), padded)
+        return Basis(int(lags[0]), np.ascontiguousarray(steps[:, lags].T))
 
-    def _main_share(self, plain: Values) -> float:
-        """Share of the main decay."""
-        return float(1 - plain[self._shares].sum())
+    def changes(self, sim: FloatArray) -> list[FloatArray]:
+        """Changes of simulated pulses with each term of a stretch, the last parameters."""
+        changes = list[FloatArray]()
+        for i in range(self.labels.count(STRETCH)):
+            ends = []
+            for sign in (-1, 1):
+                moved = copy.deepcopy(self.response)
+                assert moved.drift is not None
+                moved.drift.stretch[i] += sign * STRETCHED
+                ends.append(moved.drifted(sim))
+            change = (ends[1] - ends[0]) / (2 * STRETCHED)
+            changes.append(np.asarray(change, np.float32))
+        return changes
+
+
+def vector_of(response: ElectronicsResponse) -> Values:
+    """The parameters themselves as a vector."""
+    return np.concatenate([*response.parameters.values()])
+
+
+def by_name(response: ElectronicsResponse, values: Values) -> dict[str, float]:
+    """Values of the parameters by name and number."""
+    parts = response.parameters.items()
+    names = [f"{name}.{i}" for name, part in parts for i in range(1, len(part) + 1)]
+    return dict(zip(names, values.tolist(), strict=True))
 
 
 def with_decay(response: ElectronicsResponse, slope: float) -> ElectronicsResponse:

@@ -13,6 +13,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -233,7 +234,7 @@ def check(
 def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult:
     """Read both sides as in a training, and compare them."""
     if isinstance(pair, CpunetError):
-        return CheckResult([_refusal(pair)])
+        return CheckResult([_judged(pair.text, pair.remedy, fine=False, other=True)])
     selection, findings = parse_selection(peak, recipe.peaks), list[Finding]()
     sets: dict[str, InputSet] = {}
     kinds: tuple[tuple[str, Kind], ...] = (("data", "measured"), ("sim", "simulated"))
@@ -243,13 +244,10 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
             sets[side] = load_pulses(file, kind, recipe, selection, **how)
             recipe = sets[side].recipe
         except CpunetError as error:
-            findings.append(_refusal(error))
-    if len(sets) < 2:
-        return CheckResult(findings)
-    return CheckResult(
-        [*findings, *compare_sides(sets["sim"], sets["data"], selection, recipe.preparation)],
-        sets,
-    )
+            findings.append(_judged(error.text, error.remedy, fine=False, other=True))
+    if len(sets) == 2:
+        findings += compare_sides(sets["sim"], sets["data"], selection, recipe.preparation)
+    return CheckResult(findings, sets if len(sets) == 2 else {})
 
 
 def compare_sides(
@@ -263,16 +261,10 @@ def compare_sides(
         notes = require_both_sides(sim, data, selection)
         findings += [Finding(Level.WARNING, note) for note in notes]
     except CpunetError as error:
-        return [*findings, _refusal(error)]
+        return [*findings, _judged(error.text, error.remedy, fine=False, other=True)]
     findings += (too_short := _too_short(sim, preparation))
     for inputs, side in ((sim, "simulated"), (data, "measured")):
-        n = len(inputs.prepared)
-        text = f"{inputs.path.name}: {n} {side} pulses of {inputs.prepared.n_read} can be used"
-        remedy = f"{FEW} or more are better: a file of more events, or more energies (`peak`)"
-        findings.append(_judged(text, remedy, n >= FEW, n < MIN_PULSES))
-        findings += _lines(inputs, side, selection)
-        if not too_short:  # else pulses in their own baselines would be blamed on others
-            findings += _left_out(inputs, side)
+        findings += _of_side(inputs, side, selection, shares=not too_short)
     if min(len(sim.prepared), len(data.prepared)) < MIN_PULSES:
         return findings  # too few to compare shapes
     if not too_short:
@@ -294,10 +286,6 @@ def _judged(text: str, remedy: str, fine: bool, other: bool = False) -> Finding:
     if fine:
         return Finding(Level.FINE, text)
     return Finding(Level.ERROR if other else Level.WARNING, text, remedy)
-
-
-def _refusal(error: CpunetError) -> Finding:
-    return Finding(Level.ERROR, error.text, error.remedy)
 
 
 LONGER = (
@@ -347,32 +335,38 @@ def _too_short(sim: InputSet, preparation: PreparationConfig) -> list[Finding]:
     return findings
 
 
-def _left_out(inputs: InputSet, side: str) -> Iterator[Finding]:
-    """Warn of reasons for which a large share of the selected pulses is left out."""
-    unselected = {Rejection.ENERGY_OUTSIDE_SELECTION.label, Rejection.ENERGY_UNKNOWN.label}
-    rejections = inputs.prepared.rejections.items()
-    counts = {label: n for label, n in rejections if label not in unselected}
-    selected = len(inputs.prepared) + sum(counts.values())
-    for label, n in counts.items():
-        if n > LOST * selected or label == Rejection.COPIES.label:
-            part = f"{100 * n / selected:.0f} % of the {side} pulses left out ({label})"
-            remedy = REMEDIES.get(Rejection[label.upper()], "look at some of them")
-            yield Finding(Level.WARNING, f"{inputs.path.name}: {part}", remedy)
+def _of_side(
+    inputs: InputSet, side: str, selection: EnergySelection, *, shares: bool
+) -> Iterator[Finding]:
+    """Check number and energies of the pulses of a side, and what is left out of them.
 
-
-def _lines(inputs: InputSet, side: str, selection: EnergySelection) -> Iterator[Finding]:
-    """Check the position of the highest gamma line, which has no neighbours."""
+    Without `shares`, since pulses in their own baselines would be blamed on others.
+    """
+    name, n = inputs.path.name, len(inputs.prepared)
+    text = f"{name}: {n} {side} pulses of {inputs.prepared.n_read} can be used"
+    remedy = f"{FEW} or more are better: a file of more events, or more energies (`peak`)"
+    yield _judged(text, remedy, n >= FEW, n < MIN_PULSES)
+    # the highest gamma line has no neighbours
     highest = sorted(selection.peaks.items(), key=lambda item: item[1].energy_kev)[-1:]
-    for name, line in highest:
+    for label, line in highest:
         line_kev = line_near(inputs.energies_kev, line.energy_kev)
         if line_kev is None:
             continue
         off, factor = line_kev - line.energy_kev, line.energy_kev / line_kev
-        text = f"{inputs.path.name}: line {name} of the {side} pulses at {line_kev:.1f} keV"
+        text = f"{name}: line {label} of the {side} pulses at {line_kev:.1f} keV"
         if not (fine := abs(off) <= OFF_LINE):
             text += f", {off:+.1f} keV from where it should be"
         how = ", as by `kev_per_adc`," if side == "measured" else " in its file"
         yield _judged(text, f"energies times {factor:.5f}{how} would put it right", fine)
+    unselected = {Rejection.ENERGY_OUTSIDE_SELECTION.label, Rejection.ENERGY_UNKNOWN.label}
+    rejections = inputs.prepared.rejections.items() if shares else ()
+    counts = {label: lost for label, lost in rejections if label not in unselected}
+    selected = n + sum(counts.values())
+    for label, lost in counts.items():
+        if lost > LOST * selected or label == Rejection.COPIES.label:
+            part = f"{100 * lost / selected:.0f} % of the {side} pulses left out ({label})"
+            remedy = REMEDIES.get(Rejection[label.upper()], "look at some of them")
+            yield Finding(Level.WARNING, f"{name}: {part}", remedy)
 
 
 def _spread(sim: InputSet, data: InputSet) -> Finding:
@@ -384,25 +378,19 @@ def _spread(sim: InputSet, data: InputSet) -> Finding:
     measured, simulated = _rise_ns(_of_height_one(data), dt_ns), _rise_ns(waveforms, dt_ns)
     median_ns = float(np.median(measured))
     if np.median(simulated) < median_ns:  # then behind a Gaussian response of this median
-
-        def rises(sigma_ns: float) -> Values:
-            slow = gaussian_filter1d(waveforms, sigma_ns / dt_ns, axis=1, mode="nearest")
-            return _rise_ns(slow, dt_ns)
-
+        slowed = partial(gaussian_filter1d, waveforms, axis=1, mode="nearest")
         low, high = 0.0, median_ns
         while high - low > dt_ns / ROUNDING:
             middle = (low + high) / 2
-            slower = np.median(rises(middle)) < median_ns
+            slower = np.median(_rise_ns(slowed(middle / dt_ns), dt_ns)) < median_ns
             low, high = (middle, high) if slower else (low, middle)
-        simulated = rises(high)
-
-    def range_(values: Values) -> float:
-        return float(np.ptp(np.quantile(values, (0.05, 0.95))))
-
+        simulated = _rise_ns(slowed(high / dt_ns), dt_ns)
     ranges, errors = [], []
     for rise in (simulated, measured):
-        ranges.append(range_(rise))
-        errors.append(np.std([range_(rise[k::PARTS]) for k in range(PARTS)]) / PARTS**0.5)
+        parts = rise, *(rise[k::PARTS] for k in range(PARTS))
+        whole, *some = (float(np.ptp(np.quantile(part, (0.05, 0.95)))) for part in parts)
+        ranges.append(whole)
+        errors.append(np.std(some) / PARTS**0.5)
     text = "drift times (10 to 50 %) spread over {:.0f} ns simulated, {:.0f} ns measured"
     ratio = ranges[1] / max(ranges[0], 1e-9)
     chance = float(np.hypot(SURE * np.hypot(*errors), ROUNDING * dt_ns))

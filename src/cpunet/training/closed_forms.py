@@ -35,8 +35,8 @@ from cpunet.training.chain_parameters import SmoothParameters, with_settings
 
 Numbers = dict[str, float]
 
-_FINE_NS = 0.5
-_TIMES_NS = np.arange(0, 10_000, _FINE_NS)  # of step responses
+FINE_NS = 0.5
+TIMES_NS = np.arange(0, 10_000, FINE_NS)  # of step responses
 _RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
 # Range in which a spectrum is flat, in units of half the sampling rate, and smoothing bins.
 _PLATEAU, _SMOOTHED = (0.03, 0.1), 41
@@ -44,28 +44,6 @@ _PLATEAU, _SMOOTHED = (0.03, 0.1), 41
 
 StepResponse = Callable[[npt.ArrayLike], FloatArray]
 """A step response, in units of the full charge, at times in ns after the step."""
-
-
-def _deviating(chain: Exponentials, time_ns: FloatArray, deviation: FloatArray) -> StepResponse:
-    """The step response of a closed form, plus a deviation given at some times.
-
-    Later, the whole decays as at the end of the windows, see `ElectronicsResponse`.
-    """
-    spline = CubicSpline(time_ns, deviation)
-
-    def inside(time: FloatArray) -> FloatArray:
-        added = np.where(time < time_ns[0], 0.0, spline(time))
-        return np.asarray(chain.step(time) + added)
-
-    early, late = inside(np.array(LATE_NS))
-    rate = np.log(max(late / early, MIN_LEFT)) / (LATE_NS[1] - LATE_NS[0])
-
-    def step(t_ns: npt.ArrayLike) -> FloatArray:
-        time = np.asarray(t_ns, float)
-        after = np.maximum(time - time_ns[-1], 0.0)
-        return np.asarray(inside(time - after) * np.exp(rate * after))
-
-    return step
 
 
 def _pole_zeroed(step: StepResponse) -> StepResponse:
@@ -98,12 +76,6 @@ class Chain:
     noise: tuple[FloatArray, FloatArray] | None = None
     draws: CubicSpline | None = None
 
-    def error(self, t_ns: FloatArray) -> FloatArray:
-        """Standard deviation of the step response at times in ns; 0 if unknown."""
-        if self.draws is None:
-            return np.zeros(len(t_ns))
-        return np.asarray(np.sqrt((self.draws(t_ns) ** 2).sum(axis=-1)))
-
 
 def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) -> Numbers:
     """Parametrisation-independent numbers, by which fitted and true chains are compared.
@@ -129,52 +101,38 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
         ``noise_rms_kev`` and ``noise_corner_mhz``, the frequency at which the noise power falls
         to half.
     """
-    step, flat = chain.step(_TIMES_NS), _pole_zeroed(chain.step)
-    end_ns = _reaches_ns(step, preparation.align_fraction) + preparation.after_ns
-    half_ns = _reaches_ns(step, 0.5)
+    step, flat = chain.step(TIMES_NS), _pole_zeroed(chain.step)
     numbers = {
-        name: _reaches_ns(step, 1 - low) - _reaches_ns(step, low)
-        for name, low in _RISES.items()
+        name: reaches_ns(step, 1 - low) - reaches_ns(step, low) for name, low in _RISES.items()
     }
     for time in (500, 1000):
-        numbers[f"missing_{time}_ns"] = float(1 - flat(half_ns + time))
-    inside = _TIMES_NS[LATE_NS[0] > _TIMES_NS]
-    numbers["overshoot"] = max(0.0, float(flat(inside).max()) - 1)
+        numbers[f"missing_{time}_ns"] = float(1 - flat(reaches_ns(step, 0.5) + time))
+    numbers["overshoot"] = max(0.0, float(flat(TIMES_NS[LATE_NS[0] > TIMES_NS]).max()) - 1)
+    end_ns = reaches_ns(step, preparation.align_fraction) + preparation.after_ns
     tail_ns = np.arange(end_ns - preparation.decay_fit_ns, end_ns, dt_ns)
     slope = np.polyfit(tail_ns, np.log(np.maximum(chain.step(tail_ns), 1e-3)), 1)[0]
     if slope < 0:
         numbers["effective_decay_us"] = float(-1e-3 / slope)
-    return numbers | noise_numbers(chain)
-
-
-def reaches_ns(chain: Chain, fraction: float) -> float:
-    """Time in ns after a step at which its response reaches a fraction of its maximum."""
-    return _reaches_ns(chain.step(_TIMES_NS), fraction)
-
-
-def noise_numbers(chain: Chain) -> Numbers:
-    """RMS and corner of a chain's noise, see `chain_numbers`; empty if unknown."""
     if chain.noise is None:
-        return {}
+        return numbers
     frequency, density = chain.noise
     # frequency 0 is the baseline; the last represents half a step
     power = (density[1:-1].sum() + density[-1] / 2) * frequency[1]
-    numbers = {"noise_rms_kev": float(np.sqrt(power))}
+    numbers["noise_rms_kev"] = float(np.sqrt(power))
     low, high = (part * frequency[-1] for part in _PLATEAU)
     plateau = np.median(density[(frequency >= low) & (frequency <= high)])
-    smooth = uniform_filter1d(density, _SMOOTHED)
-    fallen = (smooth < 0.5 * plateau) & (frequency > high)
+    fallen = (uniform_filter1d(density, _SMOOTHED) < 0.5 * plateau) & (frequency > high)
     if fallen.any():
         numbers["noise_corner_mhz"] = float(frequency[fallen.argmax()])
     return numbers
 
 
-def _reaches_ns(step: FloatArray, fraction: float) -> float:
-    """Time at which a step response on the grid first reaches a fraction of its maximum."""
+def reaches_ns(step: FloatArray, fraction: float) -> float:
+    """Time at which a step response at `TIMES_NS` first reaches a fraction of its maximum."""
     level = fraction * step.max()
     after = max(1, int((step >= level).argmax()))
     low, high = step[after - 1], step[after]
-    return _FINE_NS * (after - 1 + float((level - low) / (high - low)))
+    return FINE_NS * (after - 1 + float((level - low) / (high - low)))
 
 
 _MIN_SLOW = 0.005  # share of the charge below which a mean time is meaningless
@@ -195,8 +153,8 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
         undecayed = undecayed * Exponentials.low_pass(tau)
     shares, decays = [1 - sum(fast), *fast], taus[n + n_slow :]
     if response.config.deviations:  # those of samples, whose decays are half a period late
-        late = np.exp(0.5 * float(response.dt_ns) / np.array(decays))
-        shares = (late * shares).tolist()
+        sooner = np.exp(0.5 * float(response.dt_ns) / np.array(decays))
+        shares = (sooner * shares).tolist()
     whole = undecayed * Exponentials.decaying(shares, decays)
     if not response.config.deviations:
         return Chain(name, whole.step, undecayed.step)
@@ -207,7 +165,21 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     padded = padded_length(2 * len(time_ns))
     both = (scipy.fft.irfft(of.transfer(padded), padded) for of in (response, without))
     deviation = np.subtract(*both)[deviation_lags(dt_ns)]
-    deviating = _deviating(whole, time_ns, deviation)
+    spline = CubicSpline(time_ns, deviation)
+
+    def inside(time: FloatArray) -> FloatArray:
+        added = np.where(time < time_ns[0], 0.0, spline(time))
+        return np.asarray(whole.step(time) + added)
+
+    # later, the whole decays as at the end of the windows, see `ElectronicsResponse`
+    early, late = inside(np.array(LATE_NS))
+    rate = np.log(max(late / early, MIN_LEFT)) / (LATE_NS[1] - LATE_NS[0])
+
+    def deviating(t_ns: npt.ArrayLike) -> FloatArray:
+        time = np.asarray(t_ns, float)
+        after = np.maximum(time - time_ns[-1], 0.0)
+        return np.asarray(inside(time - after) * np.exp(rate * after))
+
     draws = CubicSpline(time_ns, response.deviation_draws.T)
     return Chain(name, deviating, _pole_zeroed(deviating), draws=draws)
 
@@ -231,7 +203,7 @@ def with_noise(
     noise = network.noise
     # height of a full charge whose tail has the level of prepared pulses
     tail_ns = preparation.after_ns - 0.5 * preparation.tail_ns
-    tail_ns += reaches_ns(chain, preparation.align_fraction)
+    tail_ns += reaches_ns(chain.step(TIMES_NS), preparation.align_fraction)
     height = preparation.tail_level / float(chain.step(tail_ns))
     dt_us = 1e-3 * noise.dt_ns
     frequency = np.asarray(np.fft.rfftfreq(noise.samples, dt_us), float)

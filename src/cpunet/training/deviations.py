@@ -22,20 +22,25 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 import scipy.linalg
 from scipy.interpolate import CubicSpline
 from scipy.special import expit
 
-from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, deviation_lags
-from cpunet.training.aligned import Values
+from cpunet.networks.response_layer import (
+    DRAWS,
+    ElectronicsResponse,
+    Spectrum,
+    deviation_lags,
+)
+from cpunet.training.aligned import Basis, Derivatives, Values
+from cpunet.training.bands import Sides
 from cpunet.training.chain_parameters import SmoothParameters, with_settings
-from cpunet.training.comparison import MOST, NONE, Comparison, Moved, Sides, Spectrum
-from cpunet.training.derivatives import Basis
+from cpunet.training.comparison import MOST, NONE, Comparison, Moved
 from cpunet.training.joint import Joint
 
 # Knots in ns: the last of the dense ones and of all, and their spacing.
@@ -82,19 +87,16 @@ class Prior:
 
     def covariance(self, time_ns: Values) -> Values:
         """Covariance of the deviations at these times."""
-        begun = expit(time_ns / ONSET_NS)
-        width = self.width * (1 + (self.edge - 1) * np.exp(-((time_ns / EDGE_NS) ** 2))) * begun
-        covariance = _process(width, np.arcsinh(time_ns / LINEAR_NS), self.length)
-        if self.fine:
-            width = self.fine * np.exp(-np.abs(time_ns) / self.fine_decay) * begun
-            covariance += _process(width, time_ns, self.fine_length)
-        rough = self.rough * np.exp(-np.abs(time_ns) / self.rough_decay)
+        begun, decay = expit(time_ns / ONSET_NS), -np.abs(time_ns)
+        edge = 1 + (self.edge - 1) * np.exp(-((time_ns / EDGE_NS) ** 2))
+        smooth = self.width * edge * begun, np.arcsinh(time_ns / LINEAR_NS), self.length
+        fine = self.fine * np.exp(decay / self.fine_decay) * begun, time_ns, self.fine_length
+        covariance = np.zeros((len(time_ns), len(time_ns)))
+        for width, place, length in (smooth, fine) if self.fine else (smooth,):
+            near = np.exp(-0.5 * ((place[:, np.newaxis] - place) / length) ** 2)
+            covariance += width[:, np.newaxis] * width * near
+        rough = self.rough * np.exp(decay / self.rough_decay)
         return np.asarray(covariance + np.diag(rough**2 + 1e-12))
-
-
-def _process(width: Values, place: Values, length: float) -> Values:
-    near = np.exp(-0.5 * ((place[:, np.newaxis] - place) / length) ** 2)
-    return np.asarray(width[:, np.newaxis] * width * near)
 
 
 CHOICES: dict[str, tuple[float, ...]] = {
@@ -197,36 +199,22 @@ class Knots:
             knots.append(min(knots[-1] + max(1, round(step)), last))
         places = np.array(knots)
         self.time_ns = places * dt_ns
-
-        def scale(lag: npt.NDArray[Any]) -> Values:
-            time = lag * dt_ns
-            late = DENSE_NS * (1 + np.log(np.maximum(time, 1.0) / DENSE_NS))
-            return np.asarray(np.where(time < DENSE_NS, time, late))
-
-        inside = lags <= last
+        time, inside = lags * dt_ns, lags <= last
+        late = DENSE_NS * (1 + np.log(np.maximum(time, 1.0) / DENSE_NS))
+        scaled = np.where(time < DENSE_NS, time, late)
+        spline = CubicSpline(scaled[places - lags[0]], np.eye(len(knots)), bc_type="natural")
         self.between = np.zeros((len(lags), len(knots)))
-        spline = CubicSpline(scale(places), np.eye(len(knots)), bc_type="natural")
-        self.between[inside] = spline(scale(lags[inside]))
-        base = self._at_lags(response.transfer(padded), padded)
+        self.between[inside] = spline(scaled[inside])
+        base = scipy.fft.irfft(response.transfer(padded), padded)[lags]
         # beyond the last knot a deviation decays with the chain
-        at_last = base[last - lags[0]]
-        self.between[~inside, -1] = base[~inside] / at_last
-        self.tangents = self._tangents(response, base, padded)[places - lags[0]]
-
-    def _at_lags(self, transfer: Spectrum, padded: int) -> Values:
-        step = scipy.fft.irfft(transfer, padded)
-        first = int(self.lags[0])
-        return np.concatenate([step[first:], step[: len(self.lags) + first]])
-
-    def _tangents(self, response: ElectronicsResponse, base: Values, padded: int) -> Values:
+        self.between[~inside, -1] = base[~inside] / base[last - lags[0]]
         parameters = SmoothParameters(response)
-        columns = [
-            FREE * width * self._at_lags(change, padded)
-            for width, change in parameters.slopes_of_transfer(padded)
-        ]
+        changes = parameters.basis(padded).changes
         # half a sample of delay, and a variance of a sample squared, of either sign
         slope = np.gradient(base)
-        return np.column_stack([*columns, 0.5 * slope, 0.5 * np.gradient(slope)])
+        others = 0.5 * slope, 0.5 * np.gradient(slope)
+        free = FREE * parameters.widths[: changes.shape[1]] * changes
+        self.tangents = np.column_stack([free, *others])[places - lags[0]]
 
     def covariance(self, prior: Prior) -> Values:
         """Prior covariance of the deviations at the knots, with the chain's directions."""
@@ -273,7 +261,8 @@ def with_deviations(
     gauge = knots.between[inside].mean(axis=0)
     place, prior, first = np.zeros(len(knots.time_ns)), STARTS[0], None
     for width, most, gain in STAGES:
-        problem = Linearised([side.of(most) for side in bands], basis, width)
+        of_step = partial(Derivatives, basis)
+        problem = Linearised([side.of(most) for side in bands], of_step, width)
         before, far, halved = (np.inf, place), True, 0
         for _ in range(STEPS):
             own.set_deviation(knots.between @ place)
@@ -310,46 +299,49 @@ def with_deviations(
     if not cost < alone:
         return Deviated(response, first)
     own.set_deviation(knots.between @ place)
-    modes, draws = _widest(information, covariance)
-    along = Basis(basis.first, knots.between @ modes)
-    place = place + modes @ _with_amplitude(own, bands, along)
-    own.set_deviation(knots.between @ place, knots.between @ draws)
-    return Deviated(own, first, knots.between @ _determined(problem.information, covariance))
+    both = information, problem.information
+    modes = _with_amplitude(own, bands, knots, place, both, covariance)
+    return Deviated(own, first, modes)
 
 
-def _determined(information: Values, covariance: Values) -> Values:
-    """Directions of unit prior variance that the pulses determine, (knots, modes)."""
-    root = np.linalg.cholesky(covariance)
-    sizes, axes = np.linalg.eigh(root.T @ information @ root)
-    return np.asarray(root @ axes[:, sizes > 1])
+def _with_amplitude(
+    own: ElectronicsResponse,
+    bands: Sequence[Sides],
+    knots: Knots,
+    place: Values,
+    informations: tuple[Values, Values],
+    covariance: Values,
+) -> Values:
+    """Set the deviation, also by how shapes go with the amplitude, and draws of its errors.
 
-
-def _widest(information: Values, covariance: Values) -> tuple[Values, Values]:
-    """Directions of unit variance in which the posterior is the widest, (knots, modes).
-
-    Also draws of it, whose outer products add up to its covariance, (knots, draws).
+    Slices see the amplitude less well.  Informations are with the gauge and without; returned
+    are the directions of unit prior variance that the pulses determine, (lags, modes).
     """
     root = np.linalg.cholesky(covariance)
-    inner = np.linalg.cholesky(np.eye(len(root)) + root.T @ information @ root)
+    inner = np.linalg.cholesky(np.eye(len(root)) + root.T @ informations[0] @ root)
+    # directions of unit variance in which the posterior is the widest, (knots, modes)
     left, widths, _ = np.linalg.svd(root @ scipy.linalg.inv(inner).T)
+    modes = left[:, :MODES] * widths[:MODES]
+    # draws of the posterior, whose outer products add up to its covariance, (knots, draws)
     normal = np.random.default_rng(0).standard_normal((len(root), DRAWS)) / np.sqrt(DRAWS)
-    normal *= SHARED
-    draws = root @ scipy.linalg.solve_triangular(inner.T, normal)
-    return np.asarray(left[:, :MODES] * widths[:MODES]), np.asarray(draws)
+    draws = root @ scipy.linalg.solve_triangular(inner.T, SHARED * normal)
 
-
-def _with_amplitude(own: ElectronicsResponse, bands: Sequence[Sides], modes: Basis) -> Values:
-    """Step in the modes by how shapes go with the amplitude, which slices see less well."""
-    transfer, n = own.transfer(bands[0].padded), modes.changes.shape[1]
+    along = Basis(int(knots.lags[0]), knots.between @ modes)
+    transfer, n = own.transfer(bands[0].padded), modes.shape[1]
     information, right = np.eye(n), np.zeros(n)
     for sides in bands:
-        difference = Joint(sides).difference(transfer, modes)
-        root = np.linalg.cholesky(difference.covariance)
-        slopes = scipy.linalg.solve_triangular(root, difference.slopes, lower=True)
+        difference = Joint(sides).difference(transfer, along)
+        whitened = partial(
+            scipy.linalg.solve_triangular, np.linalg.cholesky(difference.covariance), lower=True
+        )
+        slopes = whitened(difference.slopes)
         information += slopes.T @ slopes
-        right -= slopes.T @ scipy.linalg.solve_triangular(root, difference.values, lower=True)
+        right -= slopes.T @ whitened(difference.values)
         right += difference.shared
-    return np.asarray(np.linalg.solve(information, right))
+    place = place + modes @ np.linalg.solve(information, right)
+    own.set_deviation(knots.between @ place, knots.between @ draws)
+    sizes, axes = np.linalg.eigh(root.T @ informations[1] @ root)
+    return np.asarray(knots.between @ (root @ axes[:, sizes > 1]))
 
 
 class Linearised:
@@ -367,10 +359,7 @@ class Linearised:
         with np.errstate(divide="ignore", invalid="ignore"):  # far away, pulses have no edge
             here = (Comparison(sides, transfer, *self.how) for sides in self.bands)
             differences = [d for comparison in here for d in comparison.differences(basis)]
-        finite = [
-            np.isfinite(d.slopes).all() & np.isfinite(d.values).all() for d in differences
-        ]
-        if not all(finite):
+        if not all(np.isfinite(of).all() for d in differences for of in (d.slopes, d.values)):
             return np.nan
         n, cost = len(place), 0.0
         self.right = np.zeros(n)

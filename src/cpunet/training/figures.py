@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from cpunet.plotting import COLOURS, DATA_FILL, SPARE_COLOURS, label, styled
 from cpunet.pulses.parameters import align_half_maximum
-from cpunet.training.closed_forms import Chain, reaches_ns
+from cpunet.training.closed_forms import TIMES_NS, Chain, reaches_ns
 
 Floats = npt.NDArray[np.floating]
 
@@ -107,12 +107,12 @@ def response_figure(
     tail = np.geomspace(100.0, tail_ns, POINTS)
     steps, errors = [], []
     for chain, colour, width in drawn:
-        half_ns = reaches_ns(chain, 0.5)
+        half_ns, band = reaches_ns(chain.step(TIMES_NS), 0.5), np.zeros(len(long_ns))
         steps.append(chain.step(long_ns + half_ns))
         look: dict[str, Any] = {"color": colour, "linewidth": width}
         panels["step"].plot(long_ns, steps[-1], label=chain.name, **look)
-        band = SIGMAS * chain.error(long_ns + half_ns)
-        if band.any():
+        if chain.draws is not None:
+            band = SIGMAS * np.sqrt((chain.draws(long_ns + half_ns) ** 2).sum(axis=-1))
             text = f"± {SIGMAS:g} standard deviations"
             around = steps[-1] - band, steps[-1] + band
             panels["step"].fill_between(long_ns, *around, color=colour, alpha=0.3, label=text)

@@ -20,9 +20,9 @@ import scipy.linalg
 from cpunet.networks.by_height import CURVE_KNOTS, LAG_KNOTS, PER_STEP
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.aligned import Aligned, Floats, Values
+from cpunet.training.bands import Sides
 from cpunet.training.chain_fit import Fitted, Parabola, bounded_step, chi_square
 from cpunet.training.chain_parameters import SmoothParameters, with_settings
-from cpunet.training.comparison import Sides
 from cpunet.training.deviations import SHARED, Linearised, posterior
 
 
@@ -53,7 +53,7 @@ PART, LAG_STEP, CURVE_STEP = 0.02, 0.01, 1e-4  # of the differences
 
 
 class Moves:
-    """Derivatives of aligned pulses by finite differences, as of `derivatives.Derivatives`."""
+    """Derivatives of aligned pulses by finite differences, as of `aligned.Derivatives`."""
 
     def __init__(self, at: Unknowns, sides: Sides, aligned: Aligned, heights: Floats) -> None:
         moved, (clean, _) = list[Aligned](), sides.translated(at.own.transfer(sides.padded))

@@ -116,13 +116,9 @@ def _noise_covariance(noise: BaselineNoise, sizes: LinearInverse, pulse: Values)
     samples = max(sizes.after, sizes.level[1]) - first
     density = noise.density_of(max(noise.samples, 2 * samples))
     correlation = scipy.fft.irfft(density)[:samples]
-
-    def mean_over(stretch: tuple[int, int]) -> Values:
-        row = np.zeros(samples)
-        row[stretch[0] - first : stretch[1] - first] = 1 / (stretch[1] - stretch[0])
-        return row
-
-    base, level = mean_over(sizes.baseline), mean_over(sizes.level)
+    base, level = means = np.zeros((2, samples))
+    for row, (begin, stop) in zip(means, (sizes.baseline, sizes.level), strict=True):
+        row[begin - first : stop - first] = 1 / (stop - begin)
     taken = np.eye(sizes.before + sizes.after, samples, -sizes.before - first)
     taken = taken - base - np.outer(pulse, level - base)
     return np.asarray(taken @ scipy.linalg.toeplitz(correlation) @ taken.T, float)

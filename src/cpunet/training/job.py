@@ -28,9 +28,9 @@ from cpunet.pulses.loading import (
 )
 from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
+from cpunet.training.chain_description import DRIFT, beyond
 from cpunet.training.chain_fit import Fitter
 from cpunet.training.check import Level, compare_sides
-from cpunet.training.diagnosis import DRIFT, beyond
 from cpunet.training.inverse import fit_inverse
 from cpunet.training.pulse_sets import MIN_PULSES, Continuum, PulseSets, continuum
 from cpunet.training.response_fit import fit_response
@@ -100,13 +100,7 @@ class TrainingJob:
             return train_networks(self)
 
     def run(
-        self,
-        parts: dict[str, Any],
-        recipe: Recipe,
-        started: str,
-        seconds: float,
-        records: list[Record],
-        **more: Any,
+        self, parts: dict[str, Any], recipe: Recipe, started: str, clock: float, **more: Any
     ) -> Run:
         """The run of trained parts.
 
@@ -116,39 +110,26 @@ class TrainingJob:
             ``ren``, ``iren`` and others to store.
         recipe
             Recipe as trained; a stretch or deviations may have been added to its chain.
-        started, seconds, records
-            When the training began, the time that it took, and its log.
+        started, clock
+            When the training began, and what `time.perf_counter` said then.
         more
-            Further facts of the run.
+            Further facts of the run, as its ``log``.
         """
-        run = Run.of(
-            parts,
-            recipe,
-            peak=self.peak,
-            seed=self.seed,
-            device=self.device,
-            started=started,
-            seconds=round(seconds, 1),
-            dt_ns=self.data.dt_ns,
-            versions=versions(),
-            sim=self.sim.provenance(),
-            data=self.data.provenance(),
-            **more,
-        )
-        return run.model_copy(update={"log": records})
+        facts = {"peak": self.peak, "seed": self.seed, "device": self.device}
+        facts |= {"started": started, "seconds": round(time.perf_counter() - clock, 1)}
+        facts |= {"dt_ns": self.data.dt_ns, "versions": versions()}
+        facts |= {"sim": self.sim.provenance(), "data": self.data.provenance()}
+        return Run.of(parts, recipe, **facts, **more)
 
 
-def of_channel(name: str, pair: Pair, folder: Path, **how: Any) -> Path:
-    """The folder of the run of a channel, trained in a process of its own."""
-    if how["resume"] and (folder / INFO).is_file():
+def trained_in(name: str, pair: Pair, out: Path | None, *, force: bool, **how: Any) -> Run:
+    """Read both sides, train and write a run; `how` is what `TrainingJob.of` takes.
+
+    Of several channels, each has a name, and a run that is complete is resumed by loading it.
+    """
+    if name and out is not None and how["resume"] and (out / INFO).is_file():
         log.info(f"{name}: trained already")
-        return folder
-    trained_in(folder, pair, **how)
-    return folder
-
-
-def trained_in(out: Path | None, pair: Pair, force: bool, **how: Any) -> Run:
-    """Read both sides, train and write a run; `how` is what `TrainingJob.of` takes."""
+        return Run.load(out)
     files = *pair[0].files, *pair[1].files
     networks, folder = how["recipe"].networks, None
     if networks:
@@ -176,7 +157,7 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
     CpunetError
         If pulses or baselines are too few, or the fit diverges.
     """
-    started, clock = datetime.now(UTC), time.perf_counter()
+    started, clock = datetime.now(UTC).isoformat(timespec="seconds"), time.perf_counter()
     recipe, sim = job.recipe, job.sim.prepared.pulses
     records = list[Record]()
     with stage("Fitting") as bar:  # the number of steps is not foreseen
@@ -214,8 +195,7 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
         parts |= residuals
         if not residuals:  # the readout alone
             recipe = recipe.model_copy(update={"residual": None})
-    took, began = time.perf_counter() - clock, started.isoformat(timespec="seconds")
-    return job.run(parts, recipe, began, took, records, fit=info)
+    return job.run(parts, recipe, started, clock, log=records, fit=info)
 
 
 def _say(info: FitInfo) -> None:

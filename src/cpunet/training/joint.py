@@ -24,13 +24,13 @@ from functools import cached_property
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 import scipy.linalg
 
+from cpunet.networks.response_layer import Spectrum
 from cpunet.pulses.container import FloatArray
-from cpunet.training.aligned import Aligned, Floats, Samples, Values
-from cpunet.training.comparison import Difference, Sides, Spectrum
-from cpunet.training.derivatives import Basis, Changes, Derivatives
+from cpunet.training.aligned import Aligned, Basis, Changes, Derivatives, Floats, Values
+from cpunet.training.bands import Sides
+from cpunet.training.comparison import Difference
 
 COMPONENTS, SEGMENTS, BINS = 24, 20, 16
 CLIPPED = 4.0  # robust standard deviations at which components and segments are clipped
@@ -97,15 +97,13 @@ class Joint:
 
     def taking(self, sim: FloatArray) -> Self:
         """The same with other simulated pulses of the same events."""
-        return self.with_sides(self.sides.taking(sim))
-
-    def of_events(self, rows: slice | Samples | npt.NDArray[np.bool_]) -> Self:
-        """The same of some of the simulated pulses, and all measured ones."""
-        return self.with_sides(self.sides.of_events(rows))
+        sides = copy.copy(self.sides)
+        sides.take(sim)
+        return self.with_sides(sides)
 
     def some(self, rows: slice) -> Self:
         """The same functions of some pulses of both sides."""
-        other = self.of_events(rows)
+        other = self.with_sides(self.sides.of_events(rows))
         other.sides.data, other.data = self.sides.data[rows], self.data[rows]
         return other
 
@@ -122,7 +120,7 @@ class Joint:
         transfer
             Spectrum of the response.
         basis
-            Coordinates of the response.
+            Coordinates of the response; None for no derivatives.
         changes
             Derivatives of the simulated pulses in other coordinates, which follow.
         """
@@ -134,14 +132,13 @@ class Joint:
         each = [self._functions(draw[single]) for draw in noisy]
         covariance = self.covariance(0.5 * (np.cov(each[0].T) + np.cov(self.data.T)))
         values = np.mean(each, axis=0)
-        off, moves = values.mean(axis=0) - self.data.mean(axis=0), list[Derivatives | Changes]()
-        if basis is not None:
-            moves = [basis(self.sides, noisy[0], heights)]
+        off = values.mean(axis=0) - self.data.mean(axis=0)
+        if basis is None:
+            return Difference("joint", off, covariance)
+        moves: list[Derivatives | Changes] = [Derivatives(basis, self.sides, noisy[0], heights)]
         if changes:
             records = [self.sides.changed(draw, transfer, heights) for draw in changes]
             moves.append(Changes(self.sides, noisy[0], records))
-        if not moves:
-            return Difference("joint", off, covariance)
         of_each = np.concatenate([self._each(noisy[0], some) for some in moves], axis=2)
         of_log = np.concatenate([some.log_amplitude for some in moves], axis=1)
         parts = np.array_split(np.flatnonzero(single), PARTS)

@@ -32,9 +32,9 @@ from cpunet.pulses.two_sample import TwoSample, classifier_auc
 from cpunet.recipes.schema import Recipe, TrainingConfig
 from cpunet.training.adversarial import Game, Generator, Residual, train
 from cpunet.training.run import Record, Run
-from cpunet.training.sides import Side, Sides
 from cpunet.training.unfinished import UnfinishedRun
 from cpunet.training.verdict import FitInfo
+from cpunet.training.views import Side, Sides
 
 if TYPE_CHECKING:
     from cpunet.training.job import TrainingJob
@@ -50,16 +50,27 @@ LEAST = 0.02  # part of the mean square of a cycle that a gain must be
 _LOGS: Any = {"log_interval", "checkpoint_interval"}
 
 
-def generators(recipe: Recipe, decay: float = 0.0) -> dict[str, Generator]:
-    """New generators, with a learned linear part or none; `decay` is the data's per sample."""
+def generators(
+    recipe: Recipe, decay: float = 0.0, linear: Mapping[str, nn.Module] | None = None
+) -> dict[str, Generator]:
+    """New generators.
+
+    Parameters
+    ----------
+    recipe
+        Recipe of networks; as published, generators have no linear part.
+    decay
+        Of the data per sample, where the learned linear part begins.
+    linear
+        Solved linear parts; None for those that are learned.
+    """
     config, preparation = recipe.cyclegan.generator, recipe.preparation
     if config.linear == "none":
-        return {
-            part: Generator(PositionalUNet(config, preparation.length))
-            for part in ("ren", "iren")
-        }
-    response = LearnedResponse(preparation, decay)
-    linear = {"ren": response, "iren": LearnedInverse(response)}
+        length = preparation.length
+        return {part: Generator(PositionalUNet(config, length)) for part in ("ren", "iren")}
+    if linear is None:
+        response = LearnedResponse(preparation, decay)
+        linear = {"ren": response, "iren": LearnedInverse(response)}
     dt_ns = preparation.sampled_ns
     return {part: Generator(Residual(config, dt_ns), of) for part, of in linear.items()}
 
@@ -81,19 +92,18 @@ def train_networks(job: TrainingJob) -> Run:
 
     game, run = _played(job, recipe, partial(generators, recipe, float(decay)), noise)
     parts: dict[str, Any] = {}
-    for part, side in (("ren", "sim"), ("iren", "data")):
-        network = game.averaged(part)
+    for part, side in (("ren", game.sides.sim), ("iren", game.sides.data)):
+        network = game.average[part]
         if network.linear is None:
-            settle(network, getattr(game.sides, side), game.config)
+            settle(network, side, game.config)
         parts[part] = network.unet if network.linear is None else network
     parts |= {f"discriminator_{side}": critic for side, critic in game.critics.items()}
     if noise is not None:
         parts["noise"] = KeptNoise(noise.dt_ns)
         parts["noise"].set_noise(noise.noise)
-    more: dict[str, Any] = {"resumed_at": run.resumed_at} if run.resumed_at else {}
-    if info is not None:
-        more["fit"] = info
-    return job.run(parts, recipe, run.started, run.seconds, run.records, **more)
+    more: dict[str, Any] = {"resumed_at": run.resumed_at, "fit": info}
+    more = {name: value for name, value in more.items() if value}
+    return job.run(parts, recipe, run.started, run.clock, log=run.records, **more)
 
 
 def fill_generator(run: Run, part: str, network: Generator, device: str = "cpu") -> Generator:
@@ -137,11 +147,13 @@ def _played(
             run.records += records
             bar.update(len(records))
 
-        def begin() -> Game:
-            pair = make()
-            return Game(pair["ren"], pair["iren"], sides, settings)
-
-        game = train(begin, job.seed, listener=listen, save=run.save, start=state)
+        game = train(
+            lambda: Game(**make(), sides=sides, settings=settings),
+            job.seed,
+            listener=listen,
+            save=run.save,
+            start=state,
+        )
     return game, run
 
 
@@ -183,22 +195,17 @@ def learned_residuals(
         if n >= ENOUGH:
             why = "they know no energies, by which the electronics act"
         return {}, {"networks": f"left out; {why}"}, []
-    config, preparation = recipe.cyclegan.generator, recipe.preparation
+    response = SolvedResponse(chain.response, recipe.preparation)
+    linear = {"ren": response, "iren": SolvedInverse(inverse)}
     noise = TraceNoise(chain.noise, chain.tails)
-
-    def make() -> dict[str, Generator]:
-        linear = SolvedResponse(chain.response, preparation), SolvedInverse(inverse)
-        made = (Generator(Residual(config, preparation.sampled_ns), of) for of in linear)
-        return dict(zip(("ren", "iren"), made, strict=True))
-
-    game, run = _played(job, recipe, make, noise)
+    game, run = _played(job, recipe, partial(generators, recipe, linear=linear), noise)
     parts, gains = dict[str, Residual](), dict[str, str]()
     for name, (scale, line) in (
         ("ren", _ren_scale(game, chain, recipe)),
         ("iren", _iren_scale(game)),
     ):
         gains[f"U-Net of {name.upper()}"] = line
-        residual = game.averaged(name).unet
+        residual = game.average[name].unet
         if scale and isinstance(residual, Residual):
             with torch.no_grad():
                 for values in residual.unet.outlet.parameters():
@@ -230,12 +237,11 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> tuple[fl
     """Scale of REN's U-Net with which a classifier of held-out pulses is least right."""
     sim, data, preparation = game.sides.sim, game.sides.data, recipe.preparation
     charge, real = (side.pulses[side.seen :][:MOST].cpu().numpy() for side in (sim, data))
-    residual = game.averaged("ren").unet
+    residual = game.average["ren"].unet
     assert isinstance(residual, Residual)
-    records = chain.response(charge)
+    records, results = chain.response(charge), list[TwoSample]()
     change = applied(residual)(records)
-
-    def judged(scale: float) -> TwoSample:
+    for scale in SCALES:
         windows = finish(
             records + np.float32(scale) * change,
             preparation,
@@ -246,9 +252,8 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> tuple[fl
         windows = windows[np.isfinite(windows).all(axis=1)]
         pair = (Pulses.of(pulses, dt_ns=preparation.sampled_ns) for pulses in (real, windows))
         values = [pulse_parameters(pulses, preparation, recipe.scores) for pulses in pair]
-        return classifier_auc(real, windows, seed=0, features=(values[0], values[1]))
-
-    results = [judged(scale) for scale in SCALES]
+        features = values[0], values[1]
+        results.append(classifier_auc(real, windows, seed=0, features=features))
     best = int(np.argmin([result.auc for result in results]))
     text = f"AUC of held-out pulses {results[0].auc:.3f} → {results[-1].auc:.3f}"
     error = results[0].auc_std
@@ -258,9 +263,8 @@ def _ren_scale(game: Game, chain: ResponseGenerator, recipe: Recipe) -> tuple[fl
 @torch.no_grad()
 def _iren_scale(game: Game) -> tuple[float, str]:
     """Scale of IREN's U-Net with which held-out cycles end closest to where they began."""
-    sides, (ren, iren) = game.sides, (game.averaged(part) for part in ("ren", "iren"))
-    assert ren.linear is not None
-    assert iren.linear is not None
+    sides, pair = game.sides, dict[str, Any](game.average.items())
+    ren, iren = pair["ren"], pair["iren"]
     rows = torch.arange(sides.sim.seen, len(sides.sim.pulses))[:MOST]
     with torch.random.fork_rng():
         torch.manual_seed(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from datetime import UTC, datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -93,23 +94,15 @@ def import_weights(
     settings = {n: v * dt_ns / PUBLISHED_DT_NS for n, v in times if n.endswith("_ns")}
     settings["generator.width"] = widths.pop()
     recipe = load_recipe("published", settings)
-    run = Run.of(
-        networks,
-        recipe,
-        peak="FEP",
-        seed=None,
-        dt_ns=dt_ns,
-        seconds=0.0,
-        device="elsewhere",
-        sim=UNKNOWN,
-        data=UNKNOWN,
-        imported={
-            part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
-            for part, path in files.items()
-        },
-        imported_at=datetime.now(UTC).isoformat(timespec="seconds"),
-        versions=versions(),
-    )
+    imported = {
+        part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
+        for part, path in files.items()
+    }
+    facts: dict[str, Any] = {"peak": "FEP", "seed": None, "dt_ns": dt_ns, "seconds": 0.0}
+    facts |= {"device": "elsewhere", "sim": UNKNOWN, "data": UNKNOWN, "imported": imported}
+    when = datetime.now(UTC).isoformat(timespec="seconds")
+    facts |= {"imported_at": when, "versions": versions()}
+    run = Run.of(networks, recipe, **facts)
     return run if out is None else run.save(out, force)
 
 
@@ -137,10 +130,10 @@ def _generator(path: Path, length: int) -> PositionalUNet:
             f"{path}: no plain state dict of tensors, or damaged ({type(error).__name__}); "
             "nothing of it was executed"
         ) from error
-    pairs = state.items() if isinstance(state, dict) else [(None, state)]
-    if not all(isinstance(name, str) and isinstance(value, Tensor) for name, value in pairs):
-        raise CpunetError(f"{path}: no state dict; give a file such as fep_REN.pt")
-    first = state.get("inc.double_conv.0.weight")
+    named_tensors = isinstance(state, dict) and all(
+        isinstance(name, str) and isinstance(value, Tensor) for name, value in state.items()
+    )
+    first = state.get("inc.double_conv.0.weight") if named_tensors else None
     width = 0 if first is None or first.ndim == 0 else len(first)
     if width < 2 or width % 2:
         raise CpunetError(

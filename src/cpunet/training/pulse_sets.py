@@ -22,8 +22,8 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.aligned import Frame, Samples, Values
-from cpunet.training.comparison import MOST, Sides
-from cpunet.training.drawn_noise import Noise
+from cpunet.training.bands import Noise, Sides
+from cpunet.training.comparison import MOST
 
 # Ratio of the limits of a band; the next is used only if no band of the previous is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)
@@ -191,6 +191,13 @@ class PulseSets:
     continuum
         Reads the pulses of both sides away from all lines, for `single_sites`.
 
+    Attributes
+    ----------
+    parted, names
+        Each band, with its pulses of both sides in random order; their names.
+    tail_slope
+        Median slope per sample of the logarithm of the data's tails.
+
     Raises
     ------
     CpunetError
@@ -207,27 +214,18 @@ class PulseSets:
 
     def __post_init__(self) -> None:
         require_energies(self.sim.energy_kev)
+        both = self.sim.energy_kev, self.data.energy_kev
         # in random order, so that any first part is representative
         self.parted = [
             (band, [self.rng.permutation(len(rows)) for rows in (band.sim, band.data)])
-            for band in energy_bands(
-                self.sim.energy_kev, self.data.energy_kev, self.recipe.peaks
-            )
+            for band in energy_bands(*both, self.recipe.peaks)
         ]
-
-    @property
-    def names(self) -> list[str]:
-        """Names of the bands."""
-        return [band.name for band, _ in self.parted]
-
-    @property
-    def tail_slope(self) -> float:
-        """Median slope per sample of the logarithm of the data's tails."""
+        self.names = [band.name for band, _ in self.parted]
         samples = self.recipe.preparation.decay_fit_samples
         lever = np.arange(samples) - 0.5 * (samples - 1)
         tails = self.data.waveforms[spread(len(self.data), DRAWN), -samples:]
         slopes = np.log(np.maximum(tails, 1e-3)) @ (lever / (lever @ lever))
-        return float(np.nanmedian(slopes))
+        self.tail_slope = float(np.nanmedian(slopes))
 
     def sides(self) -> list[Sides]:
         """Pulses of both sides in each band, for the comparison at every sample."""

@@ -5,22 +5,22 @@ from __future__ import annotations
 import json
 import logging
 import re
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from scipy.stats import median_abs_deviation
 
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.stand import Stand
 from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
+from cpunet.settings import plain, yaml_text
 from cpunet.tables import text_table, with_std
 from cpunet.training.chain_description import DescribedChain, describe_chain
-from cpunet.training.closed_forms import Numbers, chain_numbers, true_chain_of, true_parameters
-from cpunet.training.response_tables import array_page, as_csv, as_yaml
+from cpunet.training.closed_forms import chain_numbers, true_chain_of, true_parameters
 from cpunet.training.run import RunLike, as_run
 
 if TYPE_CHECKING:
@@ -64,9 +64,19 @@ ROWS = {
     r"noise_corner_mhz": ("noise corner", "MHz"),
     r"chi_square_per_moment": ("chi-square per moment", ""),
 }
+# What a page of channels shows, and where a channel stands out: so many robust standard
+# deviations from the median, of at least so many channels.
+SHOWN = {
+    "rise_10_90_ns": "rise 10–90 % [ns]",
+    "slow_share": "late charge",
+    "missing_500_ns": "not yet collected after 500 ns",
+    "effective_decay_us": "effective decay [µs]",
+    "noise_rms_kev": "noise RMS [keV]",
+    "chi_square_per_moment": "chi-square per moment",
+}
+FAR, FEW = 4.0, 5
 
 
-@dataclass(frozen=True, eq=False, repr=False)
 class Response:
     """Readout chains of runs in terms of physics.
 
@@ -76,35 +86,39 @@ class Response:
         The chains of the runs.
     truth
         True readout, if given.
+
+    Attributes
+    ----------
+    true_values
+        The same quantities of the true readout; empty if it is not given.
+    difference, sigma
+        Difference of the first run from the truth, and the same in units of its error; without
+        those that have none.
     """
 
-    runs: list[DescribedChain]
-    truth: Electronics | None = None
-
-    @cached_property
-    def true_values(self) -> Numbers:
-        """The same quantities of the true readout; empty if it is not given."""
-        if self.truth is None:
-            return {}
-        first, chain = self.runs[0].run, true_chain_of(self.truth)
-        numbers = chain_numbers(chain, first.recipe.preparation, first.dt_ns)
-        return true_parameters(self.truth) | numbers
-
-    @cached_property
-    def difference(self) -> Numbers:
-        """Difference of the first run from the truth."""
-        values = self.runs[0].values
-        return {n: values[n] - true for n, true in self.true_values.items() if n in values}
-
-    @cached_property
-    def sigma(self) -> Numbers:
-        """The same in units of the error; without those that have no error."""
-        errors = self.runs[0].errors
-        return {
-            name: difference / errors[name]
-            for name, difference in self.difference.items()
-            if errors.get(name)
+    def __init__(
+        self, runs: Sequence[DescribedChain], truth: Electronics | None = None
+    ) -> None:
+        self.runs, self.truth, self.true_values = runs, truth, dict[str, float]()
+        first = runs[0]
+        if truth is not None:
+            of_truth, preparation = true_chain_of(truth), first.run.recipe.preparation
+            self.true_values = true_parameters(truth)
+            self.true_values |= chain_numbers(of_truth, preparation, first.run.dt_ns)
+        own, errors, true = first.values, first.errors, self.true_values
+        self.difference = {n: own[n] - true[n] for n in true if n in own}
+        self.sigma = {n: off / errors[n] for n, off in self.difference.items() if errors.get(n)}
+        sources = [*(chain.values for chain in runs), true]
+        rows = {  # by name, in the order of `ROWS`: place, label, unit
+            name: next(
+                (place, re.sub(pattern, text, name), unit)
+                for place, (pattern, (text, unit)) in enumerate(ROWS.items())
+                if re.fullmatch(pattern, name)
+            )
+            for source in sources
+            for name in source
         }
+        self.rows = dict(sorted(rows.items(), key=lambda row: row[1][0]))
 
     @property
     def values(self) -> DataFrame:
@@ -114,7 +128,7 @@ class Response:
         columns = {chain.run.name: chain.values for chain in self.runs}
         if self.truth is not None:
             columns["truth"] = self.true_values
-        return DataFrame(columns).reindex(self._names)
+        return DataFrame(columns).reindex([*self.rows])
 
     def plot(self) -> Figure:
         """Step and impulse response, tail and noise."""
@@ -135,18 +149,16 @@ class Response:
         CpunetError
             If the folder exists and `force` is off, or is of something else.
         """
-        content: dict[str, Any] = {"cpunet": cpunet.__version__, "runs": []}
-        for chain in self.runs:
-            facts = {"path": chain.run.name, "recipe": chain.run.recipe.name}
-            facts |= {name: getattr(chain.run, name) for name in _OF_RUN}
-            content["runs"].append(facts | {name: getattr(chain, name) for name in _OF_CHAIN})
+        runs = [
+            {"path": chain.run.name, "recipe": chain.run.recipe.name}
+            | {name: getattr(chain.run, name) for name in _OF_RUN}
+            | {name: getattr(chain, name) for name in _OF_CHAIN}
+            for chain in self.runs
+        ]
+        content: dict[str, Any] = {"cpunet": cpunet.__version__, "runs": runs}
         if self.truth is not None:
-            content["truth"] = {
-                "name": self.truth.name,
-                "values": self.true_values,
-                "difference": self.difference,
-                "sigma": self.sigma,
-            }
+            content["truth"] = {"name": self.truth.name, "values": self.true_values}
+            content["truth"] |= {"difference": self.difference, "sigma": self.sigma}
         folders = [chain.run.folder for chain in self.runs]
         with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
             text = json.dumps(content, indent=1, ensure_ascii=False)
@@ -166,19 +178,15 @@ class Response:
             head += [self.truth.name, *(["difference", "σ"] if alone else [])]
             sources.append((self.true_values, {}))
         rows = []
-        for name in self._names:
-            _, label, unit = _row(name)
+        for name, (_, label, unit) in self.rows.items():
             scale = {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
             cells = [f"{label} [{unit}]" if unit else label]
             for pair in sources:
                 scaled = (scale * of[name] if name in of else None for of in pair)
                 cells.append(with_std(*scaled))
             if self.truth is not None and alone:
-                difference, true, text = (
-                    self.difference.get(name),
-                    self.true_values.get(name),
-                    "",
-                )
+                difference, true = self.difference.get(name), self.true_values.get(name)
+                text = ""
                 if difference is not None and unit == "%":  # of shares in percentage points
                     text = f"{100 * difference:+.2f} pp"
                 elif difference is not None and true:
@@ -191,13 +199,6 @@ class Response:
         truth = "" if self.truth is None else f", truth {self.truth.name}"
         names = ", ".join(Path(chain.run.name).name for chain in self.runs)
         return f"<{type(self).__name__} of {names}{truth}>"
-
-    @property
-    def _names(self) -> list[str]:
-        """Quantities that any run or the truth has, in the order of `ROWS`."""
-        sources = [*(chain.values for chain in self.runs), self.true_values]
-        names = {name: None for source in sources for name in source}
-        return sorted(names, key=lambda name: _row(name)[0])
 
 
 def response(
@@ -260,10 +261,79 @@ def response(
     return result
 
 
-def _row(name: str) -> tuple[int, str, str]:
-    """Place, label and unit of a quantity in `ROWS`."""
-    return next(
-        (place, re.sub(pattern, text, name), unit)
-        for place, (pattern, (text, unit)) in enumerate(ROWS.items())
-        if re.fullmatch(pattern, name)
-    )
+def as_yaml(chains: Mapping[str, DescribedChain]) -> str:
+    """Value and error of each number, and correlations, by channel."""
+    content = {}
+    for name, chain in chains.items():
+        names = [name for name in chain.moved if chain.errors.get(name)]
+        moved = np.array([chain.moved[name] for name in names])  # (numbers, axes)
+        covariance = moved @ moved.T if names else np.zeros((0, 0))
+        sizes = np.sqrt(covariance.diagonal())
+        content[name] = {
+            "run": chain.run.name,
+            "good": chain.run.ok,
+            "numbers": {
+                n: {"value": v, "error": chain.errors.get(n)} for n, v in chain.values.items()
+            },
+            "correlations": {
+                "names": names,
+                "matrix": (covariance / np.outer(sizes, sizes)).round(4).tolist(),
+            },
+        }
+    return yaml_text(plain(content))
+
+
+def as_csv(chains: Mapping[str, DescribedChain]) -> str:
+    """A line for each channel: each number with its error."""
+    from pandas import DataFrame
+
+    rows = {
+        channel: {"good": int(chain.run.ok)}
+        | {
+            f"{name}{end}": of.get(name)
+            for name in chain.values
+            for end, of in (("", chain.values), ("_error", chain.errors))
+        }
+        for channel, chain in chains.items()
+    }
+    return str(DataFrame.from_dict(rows, orient="index").to_csv(index_label="channel"))
+
+
+def outliers(values: Sequence[float | None], errors: Sequence[float | None]) -> list[bool]:
+    """Which values are far from the median, in robust standard deviations and in errors.
+
+    Examples
+    --------
+    >>> outliers([1.0, 1.1, 0.9, 1.0, 1.05, 3.0], [0.01] * 6)
+    [False, False, False, False, False, True]
+    """
+    numbers = np.array([np.nan if value is None else value for value in values], float)
+    own = np.array([error or 0.0 for error in errors])
+    finite = numbers[np.isfinite(numbers)]
+    if finite.size < FEW:
+        return [False] * len(numbers)
+    spread = np.hypot(median_abs_deviation(finite, scale="normal"), own)
+    distances = np.abs(numbers - np.median(finite))
+    return [bool(a > FAR * s) for a, s in zip(distances, spread, strict=True)]
+
+
+def array_page(chains: Mapping[str, DescribedChain]) -> str:
+    """A page of all channels, on which outliers and bad fits are marked."""
+    from cpunet.html_pages import rendered
+
+    columns: dict[str, list[tuple[str, bool]]] = {}
+    for name, title in SHOWN.items():
+        values = [chain.values.get(name) for chain in chains.values()]
+        errors = [chain.errors.get(name) for chain in chains.values()]
+        if any(value is not None for value in values):
+            texts = [with_std(v, e) for v, e in zip(values, errors, strict=True)]
+            columns[title] = list(zip(texts, outliers(values, errors), strict=True))
+    rows = list[dict[str, Any]]()
+    for i, (channel, chain) in enumerate(chains.items()):
+        cells = [column[i] for column in columns.values()]
+        marked = sum(far for _, far in cells) + (not chain.run.ok)
+        rows.append({"name": channel, "good": chain.run.ok, "cells": cells, "marked": marked})
+    rows.sort(key=lambda row: -row["marked"])
+    marked = sum(bool(row["marked"]) for row in rows)
+    title = f"Readouts of {len(rows)} channels: {marked} to look at"
+    return rendered("array.html", title=title, head=list(columns), rows=rows, far=f"{FAR:g}")

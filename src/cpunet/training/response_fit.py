@@ -21,11 +21,12 @@ from typing import NamedTuple
 import numpy as np
 
 from cpunet.networks.response_layer import ElectronicsResponse
+from cpunet.training.bands import Sides
+from cpunet.training.chain_description import DRIFT, stretched
 from cpunet.training.chain_fit import Fitted, Fitter, chi_square, fit_chain
-from cpunet.training.chain_parameters import Parameters, with_decay, with_settings
-from cpunet.training.comparison import AMPLITUDE, Comparison, Difference, Sides
+from cpunet.training.chain_parameters import by_name, with_decay, with_settings
+from cpunet.training.comparison import AMPLITUDE, Comparison, Difference
 from cpunet.training.deviations import with_deviations
-from cpunet.training.diagnosis import DRIFT, stretched
 from cpunet.training.heights import with_heights
 from cpunet.training.pulse_sets import SINGLE, PulseSets
 from cpunet.training.verdict import WIDTH, FitInfo, Verdict, verdict
@@ -176,7 +177,7 @@ def described(
     """Describe the fit of a response."""
     response, pulls, quantiles = best.response, dict[str, float](), list[Difference]()
     compared: dict[str, list[int]] = {}
-    parameters, covariance = Parameters(best.chain.response), best.chain.covariance
+    covariance = best.chain.covariance
     for name, sides in zip(sets.names, bands, strict=True):
         transfer = response.transfer(sides.padded)
         here = Comparison(sides.entering(response), transfer, WIDTH)
@@ -201,7 +202,7 @@ def described(
         moments=round(functions),
         steps=fitter.steps,
         parameters=values,
-        errors=parameters.by_name(np.sqrt(covariance.diagonal())),
+        errors=by_name(best.chain.response, np.sqrt(covariance.diagonal())),
         covariance=covariance.tolist(),
         delay_ns=response.delay_ns(),
         pulls=pulls,

@@ -93,8 +93,8 @@ def train(
     from cpunet.recipes import load_recipe
     from cpunet.recipes.schema import Recipe
     from cpunet.settings import require_seed
-    from cpunet.training.job import of_channel, trained_in
-    from cpunet.training.run import Run, resolve_device
+    from cpunet.training.job import trained_in
+    from cpunet.training.run import resolve_device
 
     target = None if out is None else Path(out)
     if target is not None and not isinstance(recipe, Recipe):
@@ -107,15 +107,13 @@ def train(
     how: dict[str, Any] = {"force": force, "recipe": chosen, "peak": peak, "seed": seed}
     how |= {"device": device, "resume": resume}
     trained: Run | Outcome[Run]
-    of_all: list[str] = []
-    if sides[1].table != ALL:
-        trained = trained_in(target, sides, **how)
+    of_all = ["--data-table", ALL] if sides[1].table == ALL else []
+    if not of_all:
+        trained = trained_in("", sides, target, **how)
     elif target is None:
         raise CpunetError("`out`: runs of all channels do not stay in memory", "give a folder")
     else:
-        folders = each_channel(paired(*sides), target, partial(of_channel, **how))
-        runs = {name: Run.load(folder) for name, folder in folders.done.items()}
-        trained, of_all = Outcome(runs, folders.failed), ["--data-table", ALL]
+        trained = each_channel(paired(*sides), target, partial(trained_in, **how))
     if target is not None and all(side.pulses is None for side in sides):
         words: list[object] = ["--sim", sides[0].path, "--data", sides[1].path, *of_all]
         if trained.ok:

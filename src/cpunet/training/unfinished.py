@@ -118,12 +118,7 @@ class UnfinishedRun:
         self.records: list[Record] = []
         # as a file has it: no tuples, and no subclass of a number or a text
         self._fingerprint = json.loads(json.dumps(fingerprint))
-        self._clock = time.perf_counter()
-
-    @property
-    def seconds(self) -> float:
-        """Time taken so far, without lost iterations and pauses."""
-        return time.perf_counter() - self._clock
+        self.clock = time.perf_counter()  # less the time before, without lost iterations
 
     def begin(self, *, resume: bool) -> State | None:
         """The state to continue from, or None.
@@ -153,7 +148,7 @@ class UnfinishedRun:
         state: State = then["state"]
         self.started, self.records = then["started"], then["records"]
         self.resumed_at = [*then["resumed_at"], state["iteration"]]
-        self._clock -= then["seconds"]
+        self.clock -= then["seconds"]
         log.info(f"going on after {state['iteration']} iterations")
         return state
 
@@ -162,8 +157,9 @@ class UnfinishedRun:
         if self.folder is None:
             return
         content = {"state": state, "fingerprint": self._fingerprint, "records": self.records}
-        content |= {"started": self.started, "seconds": self.seconds}
-        torch.save(content | {"resumed_at": self.resumed_at}, stream := io.BytesIO())
+        content |= {"started": self.started, "resumed_at": self.resumed_at}
+        content["seconds"] = time.perf_counter() - self.clock
+        torch.save(content, stream := io.BytesIO())
         aside = self.folder / ASIDE
         try:
             aside.write_bytes(stream.getbuffer())

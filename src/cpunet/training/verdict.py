@@ -16,7 +16,8 @@ from cpunet.electronics.pile_up_tails import TailsInfo
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.loading import InfoPart
 from cpunet.pulses.two_sample import MIN_PULSES, classifier_auc
-from cpunet.training.comparison import AMPLITUDE, Comparison, Sides
+from cpunet.training.bands import Sides
+from cpunet.training.comparison import AMPLITUDE, Comparison
 
 # Limits: chi-square per sample of the median slice, and per quantile of the amplitude; standard
 # errors of the mean pulse; AUC, which must also be so many deviations from its null.

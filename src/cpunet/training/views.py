@@ -1,5 +1,7 @@
-"""What critics see of pulses: aligned at half maximum, in units of the data's own spread.
+"""Both sides of a game, and what critics see of them: pulses in units of the data's spread.
 
+Part of the pulses of either side is held out, and critics are judged by it.  Translations get
+the noise of the data.  Views are aligned at half maximum.
 Everything has gradients, but the whole sample at which a pulse is cut.  Measured and translated
 pulses go through the same functions.  A view reaches to the end of the windows, where they are
 scaled, and has the current at its own scale: the current amplitude is a peak of a few percent.
@@ -7,13 +9,27 @@ scaled, and has the current at its own scale: the current amplitude is a peak of
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d, conv1d, pad
 
+from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import padding
+from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import ConvolutionalConfig, GruConfig, PreparationConfig
 
+log = logging.getLogger(__name__)
+
+RECENT = 20  # judgements that are averaged
+# Part of unseen pairs on which a critic is right that has won; part of a training before which
+# none is at chance, and none has won.
+WON, EARLY, HALF = 0.97, 0.25, 0.5
 BEFORE_NS, END_NS = 3200.0, 64.0  # before the half maximum; left out at the end of a window
 BASE_NS, LEVEL_NS = (-3200.0, -1600.0), (4800.0, 5600.0)  # which are scaled to 0 and 1
 EDGE_NS = -1792.0, 1280.0
@@ -23,6 +39,105 @@ CURRENT = 15.0  # of the highest currents in the view of an edge
 FINE = 0.05  # part of the highest current that a GRU resolves
 BLUR_NS, BLURRED_NS = 48.0, 1000.0  # two equal poles, and the length of their response
 BLOCK = 2000  # pulses at a time
+
+
+class Side(NamedTuple):
+    """Pulses of a side (n, samples), their energies in keV, and how many of them are seen."""
+
+    pulses: Tensor
+    energy_kev: npt.NDArray[np.float64]
+    seen: int
+
+    @classmethod
+    def of(cls, pulses: Pulses, held_out: float, seed: int, device: str = "cpu") -> Side:
+        """Pulses in random order, of which the last part is held out."""
+        order = np.random.default_rng(seed).permutation(len(pulses))
+        waveforms = torch.from_numpy(pulses.waveforms[order]).to(device)
+        kev = pulses.energy_kev[order].astype(float)
+        return cls(waveforms, kev, len(order) - round(held_out * len(order)))
+
+    def draw(self, n: int, *, unseen: bool = False) -> Tensor:
+        """Rows of a batch, of the pulses that are seen or of the others."""
+        first, stop = (self.seen, len(self.pulses)) if unseen else (0, self.seen)
+        return torch.randint(first, stop, (n,))
+
+
+class Sides(NamedTuple):
+    """Simulated and measured pulses, and what is done to translations outside the generators.
+
+    Parameters
+    ----------
+    sim, data
+        Both sides.
+    preparation
+        Their preparation.
+    noise
+        Noise of the data; None for none.
+    scaled
+        Whether translations are scaled as the data are; as published, they are not.
+    """
+
+    sim: Side
+    data: Side
+    preparation: PreparationConfig
+    noise: TraceNoise | None
+    scaled: bool
+
+    def noisy(self, pulses: Tensor, rows: Tensor) -> Tensor:
+        """Translations of simulated pulses of these rows, with noise as 1/energy."""
+        if self.noise is None:
+            return pulses
+        # seeded by torch, whose random state is part of a checkpoint
+        rng = np.random.default_rng(int(torch.randint(2**62, ())))
+        drawn = self.noise.draw(self.sim.energy_kev[rows.numpy()], pulses.shape[1], rng)
+        return pulses + torch.from_numpy(drawn).to(pulses)
+
+    def prepared(self, pulses: Tensor) -> Tensor:
+        """Windows of translations, scaled as the data are."""
+        return nominal(pulses, self.preparation) if self.scaled else pulses
+
+
+class Judge:
+    """How often critics are right on pulses that they have not seen, and when a game is over.
+
+    A critic that is right by chance on unseen pulses knows its own by heart, and has nothing to
+    teach; a critic that is nearly always right teaches nothing either, for its slope is flat.
+
+    Parameters
+    ----------
+    sides
+        Names of the critics.
+    unseen
+        Number of pulses of a side that are held out.
+
+    Attributes
+    ----------
+    over
+        Critics whose game is over, and how it ended: ``"won"`` or ``"chance"``.
+    right
+        Part of pairs of the last batch that each critic ordered rightly.
+    recent
+        The same of unseen pulses, the last judgements.
+    """
+
+    def __init__(self, sides: Sequence[str], unseen: int) -> None:
+        self.unseen, self.over, self.right = unseen, dict[str, str](), dict[str, float]()
+        self.recent: dict[str, list[float]] = {side: [] for side in sides}
+
+    def note(self, side: str, right: float, done: float) -> float:
+        """Note how often a critic is right, when a part of the training is done; the mean."""
+        recent = self.recent[side] = [*self.recent[side], right][-RECENT:]
+        mean = float(np.mean(recent))
+        if len(recent) < RECENT or side in self.over:
+            return mean
+        text = f"right on {100 * mean:.0f} % of pulses that it has not seen"
+        if mean > WON and done > HALF:
+            self.over[side], end = "won", "its game ends here, and the average before counts"
+            log.warning(f"the critic of {side} has won: it is {text}; {end}")
+        elif mean < 0.5 + 0.5 * self.unseen**-0.5 and done > EARLY:
+            self.over[side] = "chance"
+            log.info(f"the critic of {side} is {text}, as by guessing; its game ends here")
+        return mean
 
 
 def nominal(pulses: Tensor, config: PreparationConfig) -> Tensor:
@@ -91,12 +206,6 @@ def _cubic(a: Tensor, b: Tensor, c: Tensor, d: Tensor, t: Tensor) -> tuple[Tenso
     return b + t * (rise + t * (bend + t * skew)), rise + t * (2 * bend + 3 * t * skew)
 
 
-def _spread(values: Tensor, least: float) -> tuple[Tensor, Tensor]:
-    """Median and robust standard deviation of each column."""
-    middle = values.median(dim=0).values
-    return middle, 1.4826 * (values - middle).abs().median(dim=0).values + least
-
-
 def _soft(values: Tensor) -> Tensor:
     """The same near 0, and logarithms of outliers."""
     return 2 * torch.asinh(values / 2)
@@ -132,13 +241,16 @@ class View:
         poles = (lags * torch.exp(-lags * config.sampled_ns / BLUR_NS)).flip(0)
         self.blur = (poles / poles.sum())[None, None] if side == "sim" else None
         v = torch.cat([self.aligned(some) for some in torch.split(real, BLOCK)])
-        self.middle, self.spread = _spread(v, LEAST)
-        self.mean_middle, self.mean_spread = _spread(self.means(v), LEAST_MEAN)
+        self.scales = []  # medians and robust standard deviations of samples and of means
+        for values, least in ((v, LEAST), (self.means(v), LEAST_MEAN)):
+            middle = values.median(dim=0).values
+            spread = 1.4826 * (values - middle).abs().median(dim=0).values + least
+            self.scales.append((middle, spread))
         self.current = v.diff(dim=1).amax(dim=1).median()
         first, stop = (round((ns + BEFORE_NS) / config.sampled_ns) for ns in EDGE_NS)
         self.n_edge = (stop - first) // 16 * 16
         self.edge = slice(first, first + self.n_edge)
-        q = _soft((v - self.middle) / self.spread)
+        q = _soft((v - self.scales[0][0]) / self.scales[0][1])
         self.q_mean = q.mean(dim=0)
         some = (q - self.q_mean)[: 3 * BLOCK]
         _, sizes, vectors = torch.linalg.svd(some, full_matrices=False)
@@ -161,8 +273,8 @@ class View:
         """What the critic reads of windows or records (n, samples); shape (n, numbers)."""
         if self.published:
             return pulses
-        v = self.aligned(pulses)
-        q, current = (v - self.middle) / self.spread, pad(v.diff(dim=1), (1, 0)) / self.current
+        v, ((middle, spread), (mean, of_mean)) = self.aligned(pulses), self.scales
+        q, current = (v - middle) / spread, pad(v.diff(dim=1), (1, 0)) / self.current
         components = ((_soft(q) - self.q_mean) @ self.white).clamp(-8, 8)
         if isinstance(self.critic, GruConfig):  # in turn, within the 0 … 1 of its table
             begin = v.shape[1] % self.critic.samples_per_step  # where a pulse is flat
@@ -170,6 +282,6 @@ class View:
             pairs = torch.stack([torch.asinh(q / 2) / 6, fine], dim=2)[:, begin:].flatten(1)
             whole = torch.cat([pairs, components / 16], dim=1) + 0.5
             return pad(whole, (0, -whole.shape[1] % self.critic.samples_per_step))
-        means = _soft((self.means(v) - self.mean_middle) / self.mean_spread)
+        means = _soft((self.means(v) - mean) / of_mean)
         edge = _soft(q[:, self.edge]), CURRENT * (current[:, self.edge] - 0.5)
         return torch.cat([*edge, means, components], dim=1)

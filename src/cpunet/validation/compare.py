@@ -18,8 +18,7 @@ from cpunet.plotting import label
 from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.pulses.two_sample import TwoSample
 from cpunet.tables import NO_VALUE, text_table, with_std
-from cpunet.training.response import Response, response
-from cpunet.training.response_tables import FAR, outliers
+from cpunet.training.response import FAR, Response, outliers, response
 from cpunet.training.run import Run, RunLike
 from cpunet.validation.metrics import MAIN, QUANTITIES, Metrics, PeakScores, signed
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics

@@ -1,0 +1,284 @@
+"""Pulses of both sides in a band of energies, as they are compared, with noise drawn once.
+
+A fit compares many responses.  All of them have the same noise, so that their differences are
+those of the responses.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.fft
+
+from cpunet.electronics.baseline_noise import BaselineNoise
+from cpunet.electronics.drawn_pile_up import DrawnTails
+from cpunet.electronics.finishing import padding
+from cpunet.kernels import kernel
+from cpunet.networks.by_height import ByHeight
+from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, padded_length
+from cpunet.pulses.container import FloatArray
+from cpunet.training.aligned import Aligned, Floats, Frame, Samples, Values, read
+
+Rows = slice | Samples | npt.NDArray[np.bool_]
+
+# Maximum number of noise traces, each twice as long as a record.  For more pulses,
+# they share the traces, with other start samples and signs.
+NOISE_TRACES = 4096
+PLATEAU_NS = 1600.0  # after the window, over which the mean gives the height of a record
+# Times in ns from the half height between which every sample is compared, shortest and longest
+# stretches within and elsewhere, and samples compared per pulse at most.
+DENSE_NS, FINEST_NS, COARSE_NS, FEWEST = (-1000.0, 3000.0), 8.0, 64.0, 1.3
+# A measured pulse with another before it, or on its tail: height of its baseline, time from
+# which the tail counts, and its RMS in units of the median.
+QUIET, TAIL_NS, LATE_RMS = 0.05, 2400.0, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise for a set of pulses, the same at each use.
+
+    Parameters
+    ----------
+    traces
+        For an energy of 1 keV, shape (traces, samples).
+    trace, start, factor
+        Trace, start sample, and sign divided by energy, for each draw and pulse; each of shape
+        (draws, pulses).
+    left, decay
+        Pile-up tails for each record, shape (draws, pulses), and their decay over
+        a record, shape (samples,); None for none.
+    """
+
+    traces: FloatArray
+    trace: npt.NDArray[np.intp]
+    start: npt.NDArray[np.intp]
+    factor: FloatArray
+    left: FloatArray | None = None
+    decay: FloatArray | None = None
+
+    @classmethod
+    def draw(
+        cls,
+        noise: BaselineNoise,
+        energy_kev: Values,
+        length: int,
+        pairs: int,
+        rng: np.random.Generator,
+        tails: DrawnTails | None = None,
+    ) -> Noise:
+        """Draw noise for records of `length` samples.
+
+        The two draws of a pair are of opposite sign, so that the contribution of noise to a
+        mean cancels.
+        """
+        n = len(energy_kev)
+        n_traces = min(NOISE_TRACES, n * pairs)
+        traces = noise.draw(np.ones(n_traces), 2 * length, rng)
+        # each trace is used before any is used again
+        trace = np.concatenate(
+            [rng.permutation(n_traces) for _ in range(-(-n * pairs // n_traces))]
+        )
+        trace = np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)
+        sign = rng.choice((-1.0, 1.0), (pairs, n))
+        start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
+        factor = np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev
+        left = decay = None
+        if tails is not None:
+            left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
+            decay = np.asarray(tails.decay(length), np.float32)
+        return cls(traces, trace, start, np.asarray(factor, np.float32), left, decay)
+
+    def add(self, records: FloatArray, draw: int) -> FloatArray:
+        """Records of the pulses with the noise of a draw."""
+        noisy = np.empty(records.shape, np.float32)
+        trace, start, factor = (each[draw] for each in (self.trace, self.start, self.factor))
+        _add(records, self.traces, trace, start, factor, noisy)
+        if self.left is not None and self.decay is not None:
+            noisy += self.left[draw, :, np.newaxis] * self.decay
+        return noisy
+
+
+@kernel(error_model="numpy")
+def _add(
+    records: Any, traces: Any, trace: Any, start: Any, factor: Any, noisy: Any
+) -> None:  # pragma: no cover - compiled
+    """Add part of a noise trace to each record: index of the trace, start sample, factor."""
+    for row in range(len(records)):
+        drawn, first, scale = traces[trace[row]], start[row], factor[row]
+        for i in range(records.shape[1]):
+            noisy[row, i] = records[row, i] + scale * drawn[first + i]
+
+
+class Sides:
+    """Simulated pulses with their noise, and measured ones, of a band of energies.
+
+    Parameters
+    ----------
+    sim, data
+        Prepared pulses, shape (pulses, samples).
+    noise
+        Noise of the simulated pulses.
+    frame
+        What is read.
+    tail_level
+        Height of the plateau of a prepared pulse, which the noise refers to.
+    energy_kev
+        Energies of the simulated pulses.
+    rows
+        Their rows in the set that they were taken from.
+
+    Attributes
+    ----------
+    current, charge
+        Of the simulated pulses within records.
+    data, data_view
+        Measured pulses that are single, and their means over the stretches.
+    first, widths, time_ns
+        First sample and samples of each stretch that is compared, and its middle in ns from the
+        half height.
+    left_out
+        Number of the others.
+    by_height
+        What the electronics do by the height of a pulse.
+    """
+
+    by_height: ByHeight | None = None
+
+    def __init__(
+        self,
+        sim: FloatArray,
+        data: FloatArray,
+        noise: Noise,
+        frame: Frame,
+        tail_level: float,
+        energy_kev: Values,
+        rows: Samples,
+    ) -> None:
+        self.frame, self.noise, self.tail_level = frame, noise, tail_level
+        self.energy_kev, self.rows = energy_kev, rows
+        self.before, self.behind = padding(frame.dt_ns)
+        self.length = sim.shape[1] + self.before + self.behind
+        self.padded = padded_length(self.length)
+        self.take(sim)
+        every = read(data, frame)
+        self.late = slice(frame.before + round(TAIL_NS / frame.dt_ns), None)
+        late = every.pulses[:, self.late]
+        self.middle = np.median(late, axis=0)
+        self.spread = np.median(np.abs(late - self.middle), axis=0)
+        self.widest = LATE_RMS * float(np.median(self.late_rms(every)))
+        single = self.single(every)
+        self.data, self.left_out = every[single], int((~single).sum())
+        self.divide()
+
+    def __len__(self) -> int:
+        return len(self.current)
+
+    def take(self, sim: FloatArray) -> None:
+        """Let these be the simulated pulses of the same events."""
+        self.sim, inside = sim, slice(self.before, self.before + sim.shape[1])
+        self.current = np.zeros((len(sim), self.length), np.float32)
+        self.current[:, inside] = np.diff(sim, axis=1, prepend=np.float32(0))
+        self.charge = self.current.cumsum(axis=1, dtype=np.float32)
+        self.spectra = scipy.fft.rfft(self.current, self.padded)
+
+    def divide(self) -> None:
+        """Divide pulses into stretches; the fewer pulses, the longer stretches."""
+        frame, most = self.frame, FEWEST * min(len(self), len(self.data))
+        length = frame.before + frame.after
+        fine, coarse = (max(1, round(ns / frame.dt_ns)) for ns in (FINEST_NS, COARSE_NS))
+        while True:
+            first, at = list[int](), 0
+            while at < length:
+                first.append(at)
+                dense = DENSE_NS[0] <= (at - frame.before) * frame.dt_ns < DENSE_NS[1]
+                at += fine if dense else max(fine, coarse)
+            if len(first) <= most or fine > coarse:
+                break
+            fine *= 2
+        self.first = np.array(first)
+        self.widths = np.diff(np.append(self.first, length))
+        middle = self.first + 0.5 * (self.widths - 1) - frame.before
+        self.time_ns: Values = np.asarray(middle * frame.dt_ns)
+        self.data_view = self.view(self.data.pulses)
+
+    def entering(self, response: ElectronicsResponse) -> Sides:
+        """The same pulses around a readout: drift stretched, and what acts by their height."""
+        if response.drift is None and response.by_height is self.by_height:
+            return self
+        other = copy.copy(self)
+        if response.drift is not None:
+            other.take(response.drifted(self.sim))
+        other.by_height = response.by_height
+        return other
+
+    def of(self, most: int) -> Sides:
+        """The first pulses of both sides."""
+        return self if most >= max(len(self), len(self.data)) else self.some(slice(most))
+
+    def some(self, rows: slice) -> Sides:
+        """Some pulses of both sides, in stretches of their own."""
+        some = self.of_events(rows)
+        some.data = self.data[rows]
+        some.divide()
+        return some
+
+    def of_events(self, rows: Rows) -> Sides:
+        """Some of the simulated pulses, and all measured ones."""
+        some = copy.copy(self)
+        for name in ("sim", "current", "charge", "spectra", "energy_kev", "rows"):
+            setattr(some, name, getattr(self, name)[rows])
+        noise, names = self.noise, ("trace", "start", "factor")
+        drawn = {name: np.ascontiguousarray(getattr(noise, name)[:, rows]) for name in names}
+        left = None if noise.left is None else noise.left[:, rows]
+        some.noise = replace(noise, left=left, **drawn)
+        return some
+
+    def late_rms(self, aligned: Aligned) -> Values:
+        """RMS of the tail of each pulse about the median, in units of the spread."""
+        deviation = (aligned.pulses[:, self.late] - self.middle) / self.spread
+        return np.asarray(np.sqrt((deviation**2).mean(axis=1)))
+
+    def single(self, aligned: Aligned) -> npt.NDArray[np.bool_]:
+        """Which pulses have no other before them or on their tail."""
+        base = aligned.pulses[:, : self.frame.before // 4].mean(axis=1)
+        quiet: npt.NDArray[np.bool_] = np.abs(base) < QUIET
+        return quiet & (self.late_rms(aligned) < self.widest)
+
+    def view(self, aligned: Floats) -> Floats:
+        """Means of aligned pulses over the stretches, shape (pulses, stretches)."""
+        sums = np.add.reduceat(aligned, self.first, axis=1)
+        return np.asarray(sums / self.widths.astype(sums.dtype))
+
+    def translated(self, transfer: Spectrum) -> tuple[FloatArray, Floats]:
+        """Noise-free records of prepared height, and the height of each before."""
+        spectra = self.spectra * transfer.astype(np.complex64)
+        records = scipy.fft.irfft(spectra, self.padded, overwrite_x=True)[:, : self.length]
+        plateau = slice(-self.behind, round(PLATEAU_NS / self.frame.dt_ns) - self.behind)
+        heights = records[:, plateau].mean(axis=1) / np.float32(self.tail_level)
+        return np.asarray(records / heights[:, np.newaxis], np.float32), heights
+
+    def changed(self, sim: FloatArray, transfer: Spectrum, heights: Floats) -> FloatArray:
+        """What a change of the simulated pulses does to the records."""
+        change = np.diff(sim, axis=1, prepend=np.float32(0))
+        spectra = scipy.fft.rfft(change, self.padded) * transfer.astype(np.complex64)
+        records = scipy.fft.irfft(spectra, self.padded, overwrite_x=True)
+        inside = np.roll(records, self.before, axis=1)[:, : self.length]
+        return np.asarray(inside / heights[:, np.newaxis], np.float32)
+
+    def noisy(self, clean: FloatArray, heights: Floats) -> list[Aligned]:
+        """Records with each draw of the noise, read."""
+        draws = range(len(self.noise.factor))
+        return [self.read(clean, heights, draw) for draw in draws]
+
+    def read(self, clean: FloatArray, heights: Floats, draw: int | None = None) -> Aligned:
+        """Records of prepared height, with a draw of noise or none, behind the electronics."""
+        records = clean if draw is None else self.noise.add(clean, draw)
+        if self.by_height is not None:
+            height = heights[:, np.newaxis].astype(np.float32)
+            charge, noise = clean * height, (records - clean) * height
+            records = np.asarray(self.by_height(charge, self.energy_kev, noise), np.float32)
+        return read(records, self.frame)
