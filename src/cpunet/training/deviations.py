@@ -57,6 +57,9 @@ STEPS, SETTLED, CLOSE, LARGEST = 25, 0.7, 3.0, 0.05
 # Errors are larger than those of independent slices, since both kinds see the same pulses: rise
 # times (10 to 90, 1 to 99, 0.1 to 99.9 %) on seven stands scatter by this factor more.
 SHARED = 1.5
+# The same of variances, before it is compared how shapes go with the amplitude: half-samples of
+# pulses behind a ringing scatter by 1.3 to 5, and by 4 in modes that move the amplitude.
+LOOSER = 4.0
 MODES = 24  # of the posterior in which the amplitude moves it
 GAUGE = 1e10  # pulses are scaled to their level: information that holds it
 HALVED = 3  # times that a step which makes it worse is halved
@@ -328,7 +331,7 @@ def _with_amplitude(
 
     along = Basis(int(knots.lags[0]), knots.between @ modes)
     transfer, n = own.transfer(bands[0].padded), modes.shape[1]
-    information, right = np.eye(n), np.zeros(n)
+    information, right = np.eye(n) / LOOSER, np.zeros(n)
     for sides in bands:
         difference = Joint(sides).difference(transfer, along)
         whitened = partial(
