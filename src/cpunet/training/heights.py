@@ -44,6 +44,7 @@ LAST = Stage(1024, 1.5, 2e-4, 0.003)
 MOST = 2048  # pulses that are fitted, and as many that are held out
 LIMITS = (2.0, 1.4, 1.1, 0.9, 0.75, 0.6, 0.5)  # of a slew rate to begin with, in largest steps
 STEPS, DAMPING, TRIES = 10, 1e-3, 5  # of a stage; damping at first, and tries
+LONGER = (1.0, 2.0, 4.0)  # than a step: noise of the derivatives makes it too short
 WELL = 1.5  # chi-square per function, with which no slew rate is searched for
 GAIN = 20.0  # in chi-square of pulses that were held out
 # Priors: variances of the follower's logarithm per largest step, widths of the curve in parts
@@ -219,17 +220,17 @@ def _solve(
         here = Parabola(place, cost, 0, problem.information, cost, gradient)
         for _ in range(TRIES):
             damped = precision + damping * np.diag(information.diagonal())
-            tried = np.clip(place + bounded_step(here, damped, *bounds), *bounds)
-            new = cost_at(tried) + of_prior(tried)
-            if new < cost:
+            step = bounded_step(here, damped, *bounds)
+            tried = [np.clip(place + k * step, *bounds) for k in LONGER]
+            costs = [cost_at(of_step) + of_prior(of_step) for of_step in tried]
+            if min(costs) < cost:
+                unknowns.place = tried[int(np.argmin(costs))]
                 break
             damping *= 10
-        else:
-            unknowns.put(place)
+        damping *= 0.1
+        if cost - min(costs) < stage.gain * cost:
             break
-        unknowns.place, damping = tried, 0.1 * damping
-        if cost - new < stage.gain * cost:
-            break
+    unknowns.put(unknowns.place)
     if best[0] == LAGS[0]:
         unknowns.by_height.lag[:] = 0
     if best[1] == CURVES[0]:
