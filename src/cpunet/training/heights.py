@@ -8,6 +8,7 @@ stays linear.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from functools import partial
 from itertools import product
@@ -27,25 +28,23 @@ from cpunet.training.deviations import SHARED, Linearised, posterior
 
 
 class Stage(NamedTuple):
-    """Pulses of a side, width of the bounded functions, least error of a quantile, and gain.
+    """Width of the bounded functions, least error of a quantile, and gain.
 
     Quantiles of a limited current are all but equal.  A stage ends with a step that lowers the
     cost by less than the share `gain`.
     """
 
-    most: int
     width: float
     least: float
     gain: float
 
 
-FIRST = (Stage(512, 60.0, 3e-3, 0.03), Stage(512, 6.0, 1e-3, 0.03))
-LAST = Stage(1024, 1.5, 2e-4, 0.003)
-MOST = 2048  # pulses that are fitted, and as many that are held out
+FIRST, LAST = (Stage(60.0, 3e-3, 0.03), Stage(6.0, 1e-3, 0.03)), Stage(1.5, 2e-4, 0.003)
+# Pulses of a side at first and later, and most that are fitted, with as many that are held out.
+FEW, MANY, MOST = 512, 1024, 2048
 LIMITS = (2.0, 1.4, 1.1, 0.9, 0.75, 0.6, 0.5)  # of a slew rate to begin with, in largest steps
 STEPS, DAMPING, TRIES = 10, 1e-3, 5  # of a stage; damping at first, and tries
 LONGER = (1.0, 2.0, 4.0)  # than a step: noise of the derivatives makes it too short
-WELL = 1.5  # chi-square per function, with which no slew rate is searched for
 GAIN = 20.0  # in chi-square of pulses that were held out
 # Priors: variances of the follower's logarithm per largest step, widths of the curve in parts
 # of its height, and its correlation length in knots.
@@ -111,24 +110,25 @@ def with_heights(
         largest.append(np.quantile(steps, 0.99))
     by_height.step_kev[...] = max(largest)
     by_height.top_kev[...] = 1.02 * max(float(sides.energy_kev.max()) for sides in bands)
-    behind = [sides.entering(own) for sides in bands]
     halves = [min(len(sides), len(sides.data), 2 * MOST) // 2 for sides in bands]
-    fitted = [sides.of(n) for sides, n in zip(behind, halves, strict=True)]
-    for limited in False, True:
+    fitted = [sides.of(n) for sides, n in zip(bands, halves, strict=True)]
+    starts = []
+    for limited in False, True:  # a slew rate makes up for a curve, and a curve for a slew rate
+        start = copy.deepcopy(own)
+        few = [sides.of(FEW).entering(start) for sides in fitted]
         if limited:
-            _limit(own, [sides.of(FIRST[0].most) for sides in fitted])
+            _limit(start, few)
         for stage in FIRST:
-            _solve(own, [sides.of(stage.most) for sides in fitted], stage, count)
-        near, functions = chi_square(own, fitted)
-        if near < WELL * functions:
-            break  # a slew rate would make up for what is a curve
-    _solve(own, [sides.of(LAST.most) for sides in fitted], LAST, count)
+            _solve(start, few, stage, count)
+        starts.append((chi_square(start, fitted)[0], start))
+    own = min(starts, key=lambda start: start[0])[1]
+    _solve(own, [sides.of(MANY).entering(own) for sides in fitted], LAST, count)
     held = [sides.some(slice(n, 2 * n)) for sides, n in zip(bands, halves, strict=True)]
     (before, _), (after, functions) = chi_square(response, held), chi_square(own, held)
     line = f"chi-square of held-out pulses {before:.0f} → {after:.0f}"
     if before - after <= GAIN:
         return None, f"left out; {line}"
-    whole = [sides.of(2 * MOST) for sides in behind]
+    whole = [sides.of(2 * MOST).entering(own) for sides in bands]
     covariance = _solve(own, whole, LAST, count)
     return Fitted(own, after, round(functions), covariance), f"used; {line}"
 
