@@ -43,10 +43,11 @@ def without_torch(*commands: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_a_readout_is_used_without_torch(tmp_path: Path, stand):
-    run, outs = write_chain(tmp_path / "run", noise_kev=2), (tmp_path / "a", tmp_path / "b")
+    run, outs = write_chain(tmp_path / "run", noise_kev=2), [tmp_path / n for n in "abc"]
     done = without_torch(
         f"translate {run} {stand.sim} --seed 1 --out {outs[0]}",
         f"response {run} --out {outs[1]}",
+        f"export onnx {run} {outs[2]}",
     )
     assert done.returncode == 0, done.stderr
     assert all(out.exists() for out in outs)
