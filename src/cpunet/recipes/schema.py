@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, Field, PrivateAttr, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
 
 from cpunet.errors import CpunetError
 from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples, Width
@@ -85,6 +85,13 @@ class ResponseConfig(Config):
     drift_terms: DriftTerms
     deviations: bool
     by_height: bool
+
+    @field_validator("slow_ns", "fast_decays_us")
+    @classmethod
+    def _times_differ(cls, times: tuple[float, ...]) -> tuple[float, ...]:
+        if len({*times}) < len(times):
+            raise ValueError("times must differ")
+        return times
 
 
 class GruConfig(Config):

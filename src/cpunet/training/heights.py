@@ -223,12 +223,13 @@ def _solve(
             step = bounded_step(here, damped, *bounds)
             tried = [np.clip(place + k * step, *bounds) for k in LONGER]
             costs = [cost_at(of_step) + of_prior(of_step) for of_step in tried]
-            if min(costs) < cost:
-                unknowns.place = tried[int(np.argmin(costs))]
+            new = np.nan_to_num(costs, nan=np.inf)  # far away, pulses have no edge
+            if new.min() < cost:
+                unknowns.place = tried[int(new.argmin())]
                 break
             damping *= 10
         damping *= 0.1
-        if cost - min(costs) < stage.gain * cost:
+        if cost - new.min() < stage.gain * cost:
             break
     unknowns.put(unknowns.place)
     if best[0] == LAGS[0]:
