@@ -22,13 +22,14 @@ from cpunet.recipes import load_recipe
 from cpunet.settings import Set, require_seed
 from cpunet.simulation.gammas.sample import EnergyWindow
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_files import HIT_TABLE, hit_columns, read_hits
+from cpunet.simulation.hit_files import hit_columns, read_hits
 from cpunet.simulation.hit_sources import (
     GammaSource,
     HitFile,
     energy_windows,
     wanted_events,
 )
+from cpunet.simulation.hit_tables import HIT_TABLE
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT
 from cpunet.simulation.settings import SimulationSettings, detector_and_settings
