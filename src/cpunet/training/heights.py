@@ -39,7 +39,7 @@ class Stage(NamedTuple):
     gain: float
 
 
-FIRST, LAST = (Stage(60.0, 3e-3, 0.03), Stage(6.0, 1e-3, 0.03)), Stage(1.5, 2e-4, 0.003)
+FIRST, LAST = (Stage(60.0, 3e-3, 0.03), Stage(6.0, 1e-3, 0.03)), Stage(1.5, 2e-4, 0.001)
 # Pulses of a side at first and later, and most that are fitted, with as many that are held out.
 FEW, MANY, MOST = 512, 1024, 2048
 LIMITS = (2.0, 1.4, 1.1, 0.9, 0.75, 0.6, 0.5)  # of a slew rate to begin with, in largest steps
