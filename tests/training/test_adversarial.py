@@ -27,7 +27,7 @@ from cpunet.training.adversarial import (
     window_weights,
 )
 from cpunet.training.network_runs import settle
-from cpunet.training.views import RECENT, Judge, View, aligned, nominal
+from cpunet.training.views import RECENT, SHARP, Judge, View, aligned, nominal
 from games import as_published, game_of, mended, windows
 from synthetic import LOSS_NAMES, interrupted_in, load_recipe
 
@@ -286,6 +286,40 @@ def test_a_side_that_is_over_is_not_played():
     losses = game.step()
     assert not {"discriminator_data", "adversarial_ren"} & losses.keys()
     assert all(torch.equal(v, before[k]) for k, v in game.critics["data"].state_dict().items())
+
+
+def moved_by_steps(game: Game, part: str) -> bool:
+    """Whether a part of the generators moves in some iterations."""
+    before = copy.deepcopy(game.generators.state_dict())
+    for _ in range(3):
+        game.step()
+    after = game.generators.state_dict()
+    return any(name.startswith(part) and (after[name] != before[name]).any() for name in after)
+
+
+def test_a_response_is_learned_from_the_critic_alone():
+    # cycles make it too sharp, as its inverse is smooth
+    weights = "adversarial_weight=0", "cycle_weight=20"
+    game = game_of(mended(*(f"training.losses.{weight}" for weight in weights)))
+    assert not moved_by_steps(game, "ren.linear")
+    assert moved_by_steps(game, "iren.linear")
+    assert moved_by_steps(game_of(mended()), "ren.linear")
+
+
+def test_ren_does_not_move_unwatched():
+    game = game_of(mended())
+    game.judge.over["data"] = "chance"
+    assert not moved_by_steps(game, "ren.")
+    assert moved_by_steps(game, "iren.")
+
+
+def test_the_highest_currents_of_a_view_are_soft_maxima():
+    _, data = windows(40)
+    view = View("data", data, mended().discriminator, PREPARATION)
+    v = view.aligned(data)
+    excess = view.tops(v)[:, 0] - v.diff(dim=1).amax(dim=1) / view.current
+    assert excess.min() >= 0
+    assert excess.max() < math.log(v.shape[1]) / SHARP
 
 
 def test_statistics_are_those_of_a_side_without_dropout():

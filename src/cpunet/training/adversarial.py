@@ -8,9 +8,10 @@
     cycles                     IREN(REN(x) + noise) = x     REN(IREN(y)) = y
     identities                 REN(y) = y                   IREN(x) = x
 
-K is linear, solved or learned (`cpunet.networks.linear_parts`); U, a Positional U-Net, adds
-nothing at first.  As published, U is all.  Read from the top: generators, critic,
-losses, an iteration, the loop.  Critics see views of pulses (`cpunet.training.views`).
+K is linear, solved or learned (`cpunet.networks.linear_parts`), by the critic of the data
+alone; U, a Positional U-Net, adds nothing at first.  As published, U is all.  Read from the
+top: generators, critic, losses, an iteration, the loop.  Critics see views of pulses
+(`cpunet.training.views`).
 """
 
 from __future__ import annotations
@@ -237,12 +238,18 @@ class Game:
             rows, y, fake = rows[: c.cycle_size], y[: c.cycle_size], fake[: c.cycle_size]
             x, back = sim.pulses[rows], iren(y)
             losses |= self.play("sim", "iren", self.with_noise(rows), back)
+            # Its inverse is smooth, for which cycles would make a linear part too sharp.
+            fixed = ren if "data" in self.judge.over else ren.linear
+            if fixed is not None and [*fixed.parameters()]:
+                fixed.requires_grad_(False)
+                fake = self.sides.noisy(ren(x), rows)
             rms = y[:, : self.sides.preparation.baseline_samples].std(dim=1, keepdim=True)
             noise = TOLERATED * rms * (self.sides.noise is not None)  # no generator makes it
             losses["cycle_forward"] = weighted_l1(iren(prepared(fake)) - x, w)
             losses["cycle_backward"] = weighted_l1(prepared(ren(back)) - y, w, noise)
             losses["identity_data"] = weighted_l1(ren.change(y), w)
             losses["identity_sim"] = weighted_l1(iren.change(x), w)
+            ren.requires_grad_(True)
         if losses:
             kinds = ((name.partition("_")[0], loss) for name, loss in losses.items())
             weight = c.losses.model_dump()

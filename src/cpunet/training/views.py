@@ -37,6 +37,7 @@ SEGMENT_NS = 400.0
 LEAST, LEAST_MEAN = 2e-4, 1e-5  # smallest spread of samples and of means
 CURRENT = 15.0  # of the highest currents in the view of an edge
 FINE = 0.05  # part of the highest current that a GRU resolves
+TOP_NS, SHARP = (16.0, 48.0, 144.0), 60.0  # averages of the current, and of its maxima
 BLUR_NS, BLURRED_NS = 48.0, 1000.0  # two equal poles, and the length of their response
 BLOCK = 2000  # pulses at a time
 
@@ -241,12 +242,12 @@ class View:
         poles = (lags * torch.exp(-lags * config.sampled_ns / BLUR_NS)).flip(0)
         self.blur = (poles / poles.sum())[None, None] if side == "sim" else None
         v = torch.cat([self.aligned(some) for some in torch.split(real, BLOCK)])
-        self.scales = []  # medians and robust standard deviations of samples and of means
-        for values, least in ((v, LEAST), (self.means(v), LEAST_MEAN)):
+        self.current = v.diff(dim=1).amax(dim=1).median()
+        self.scales = []  # medians and robust standard deviations of samples, means and tops
+        for values, least in ((v, LEAST), (self.means(v), LEAST_MEAN), (self.tops(v), LEAST)):
             middle = values.median(dim=0).values
             spread = 1.4826 * (values - middle).abs().median(dim=0).values + least
             self.scales.append((middle, spread))
-        self.current = v.diff(dim=1).amax(dim=1).median()
         first, stop = (round((ns + BEFORE_NS) / config.sampled_ns) for ns in EDGE_NS)
         self.n_edge = (stop - first) // 16 * 16
         self.edge = slice(first, first + self.n_edge)
@@ -269,18 +270,27 @@ class View:
         """Means of segments, shape (n, segments)."""
         return avg_pool1d(v[:, None], max(1, self.config.samples(SEGMENT_NS)))[:, 0]
 
+    def tops(self, v: Tensor) -> Tensor:
+        """Soft maxima of the current, averaged over `TOP_NS`, shape (n, times)."""
+        current = v.diff(dim=1)[:, None] / self.current
+        widths = (max(1, self.config.samples(ns)) for ns in TOP_NS)
+        tops = [avg_pool1d(current, k, 1).mul(SHARP).logsumexp(2) / SHARP for k in widths]
+        return torch.cat(tops, dim=1)
+
     def __call__(self, pulses: Tensor) -> Tensor:
         """What the critic reads of windows or records (n, samples); shape (n, numbers)."""
         if self.published:
             return pulses
-        v, ((middle, spread), (mean, of_mean)) = self.aligned(pulses), self.scales
+        (middle, spread), (mean, of_mean), (top, of_top) = self.scales
+        v = self.aligned(pulses)
         q, current = (v - middle) / spread, pad(v.diff(dim=1), (1, 0)) / self.current
         components = ((_soft(q) - self.q_mean) @ self.white).clamp(-8, 8)
         if isinstance(self.critic, GruConfig):  # in turn, within the 0 … 1 of its table
             begin = v.shape[1] % self.critic.samples_per_step  # where a pulse is flat
             fine = torch.asinh((current - 1) / FINE) / 8
             pairs = torch.stack([torch.asinh(q / 2) / 6, fine], dim=2)[:, begin:].flatten(1)
-            whole = torch.cat([pairs, components / 16], dim=1) + 0.5
+            tops = _soft((self.tops(v) - top) / of_top).clamp(-8, 8)
+            whole = torch.cat([pairs, components / 16, tops / 16], dim=1) + 0.5
             return pad(whole, (0, -whole.shape[1] % self.critic.samples_per_step))
         means = _soft((self.means(v) - mean) / of_mean)
         edge = _soft(q[:, self.edge]), CURRENT * (current[:, self.edge] - 0.5)
