@@ -251,18 +251,20 @@ def test_what_is_not_finite_ends_a_training_and_is_not_kept(monkeypatch, bad):
 
 
 @pytest.mark.parametrize(
-    ("accuracy", "done", "how"),
+    ("own", "accuracy", "done", "how"),
     [
-        (0.99, 0.6, "won"),
-        (0.99, 0.4, None),
-        (0.51, 0.3, "chance"),
-        (0.51, 0.2, None),
-        (0.8, 0.9, None),
+        (0.99, 0.99, 0.6, "won"),
+        (0.99, 0.99, 0.4, None),
+        (0.8, 0.51, 0.3, "heart"),
+        (0.8, 0.51, 0.2, None),
+        (0.8, 0.8, 0.9, None),
+        (0.53, 0.51, 0.9, None),  # where a game should end
     ],
 )
-def test_games_that_are_over(caplog, accuracy, done, how):
+def test_games_that_are_over(caplog, own, accuracy, done, how):
     caplog.set_level("INFO", "cpunet")
     judge = Judge(["data"], unseen=400)
+    judge.right["data"] = own
     for _ in range(RECENT):
         judge.note("data", accuracy, done)
     assert judge.over.get("data") == how
@@ -281,7 +283,7 @@ def test_a_critic_that_has_won_leaves_the_last_good_average():
 
 def test_a_side_that_is_over_is_not_played():
     game = game_of(mended())
-    game.judge.over["data"] = "chance"
+    game.judge.over["data"] = "heart"
     before = copy.deepcopy(game.critics["data"].state_dict())
     losses = game.step()
     assert not {"discriminator_data", "adversarial_ren"} & losses.keys()
@@ -308,7 +310,7 @@ def test_a_response_is_learned_from_the_critic_alone():
 
 def test_ren_does_not_move_unwatched():
     game = game_of(mended())
-    game.judge.over["data"] = "chance"
+    game.judge.over["data"] = "heart"
     assert not moved_by_steps(game, "ren.")
     assert moved_by_steps(game, "iren.")
 

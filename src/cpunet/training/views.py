@@ -27,9 +27,9 @@ from cpunet.recipes.schema import ConvolutionalConfig, GruConfig, PreparationCon
 log = logging.getLogger(__name__)
 
 RECENT = 20  # judgements that are averaged
-# Part of unseen pairs on which a critic is right that has won; part of a training before which
-# none is at chance, and none has won.
-WON, EARLY, HALF = 0.97, 0.25, 0.5
+# Part of unseen pairs on which a critic is right that has won, and by how much more it is right
+# on its own if it knows them by heart; parts of a training before which neither is decided.
+WON, HEART, EARLY, HALF = 0.97, 0.1, 0.25, 0.5
 BEFORE_NS, END_NS = 3200.0, 64.0  # before the half maximum; left out at the end of a window
 BASE_NS, LEVEL_NS = (-3200.0, -1600.0), (4800.0, 5600.0)  # which are scaled to 0 and 1
 EDGE_NS = -1792.0, 1280.0
@@ -101,8 +101,9 @@ class Sides(NamedTuple):
 class Judge:
     """How often critics are right on pulses that they have not seen, and when a game is over.
 
-    A critic that is right by chance on unseen pulses knows its own by heart, and has nothing to
-    teach; a critic that is nearly always right teaches nothing either, for its slope is flat.
+    A critic that is right by chance on unseen pulses but not on its own knows these by heart,
+    and has nothing to teach; a critic that is nearly always right teaches nothing either, for
+    its slope is flat.  By chance on both, a game is where it should be.
 
     Parameters
     ----------
@@ -114,31 +115,32 @@ class Judge:
     Attributes
     ----------
     over
-        Critics whose game is over, and how it ended: ``"won"`` or ``"chance"``.
+        Critics whose game is over, and how it ended: ``"won"`` or ``"heart"``.
     right
         Part of pairs of the last batch that each critic ordered rightly.
     recent
-        The same of unseen pulses, the last judgements.
+        The same, and that of unseen pulses, in the last judgements.
     """
 
     def __init__(self, sides: Sequence[str], unseen: int) -> None:
         self.unseen, self.over, self.right = unseen, dict[str, str](), dict[str, float]()
-        self.recent: dict[str, list[float]] = {side: [] for side in sides}
+        self.recent: dict[str, list[tuple[float, float]]] = {side: [] for side in sides}
 
     def note(self, side: str, right: float, done: float) -> float:
         """Note how often a critic is right, when a part of the training is done; the mean."""
-        recent = self.recent[side] = [*self.recent[side], right][-RECENT:]
-        mean = float(np.mean(recent))
+        now = self.right.get(side, 0.5), right
+        recent = self.recent[side] = [*self.recent[side], now][-RECENT:]
+        own, mean = np.mean(recent, axis=0).tolist()
         if len(recent) < RECENT or side in self.over:
-            return mean
+            return float(mean)
         text = f"right on {100 * mean:.0f} % of pulses that it has not seen"
         if mean > WON and done > HALF:
             self.over[side], end = "won", "its game ends here, and the average before counts"
             log.warning(f"the critic of {side} has won: it is {text}; {end}")
-        elif mean < 0.5 + 0.5 * self.unseen**-0.5 and done > EARLY:
-            self.over[side] = "chance"
-            log.info(f"the critic of {side} is {text}, as by guessing; its game ends here")
-        return mean
+        elif mean < 0.5 + 0.5 * self.unseen**-0.5 < own - HEART and done > EARLY:
+            self.over[side], by = "heart", f"and on {100 * own:.0f} % of its own, by heart"
+            log.info(f"the critic of {side} is {text}, {by}; its game ends here")
+        return float(mean)
 
 
 def nominal(pulses: Tensor, config: PreparationConfig) -> Tensor:
