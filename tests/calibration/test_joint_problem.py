@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from itertools import chain
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from cpunet.calibration.identifiability import Linear
-from cpunet.calibration.joint_problem import JointProblem, first
+from cpunet.calibration.joint_problem import JointProblem, SlicedJoint, first
 from cpunet.calibration.nearby import Derivative, Nearby, half_maxima
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.sliced_functions import SlicedJoint
 from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
@@ -49,7 +49,7 @@ def nearby() -> Nearby:
     """Two physics: a drift that takes longer, and a wider cloud."""
     fine = charge(N, seed=1)
     base = coarse(fine)
-    half = half_maxima(base, np.zeros(N))
+    half = half_maxima(base)
     wider = sum(np.roll(base, shift, axis=1) for shift in (-1, 1)) - 2 * base
     slopes, at = (coarse(faster(fine, 0.9)) - base, wider), np.zeros(2)
     derivatives = {i: Derivative(np.float32(s), at, half) for i, s in enumerate(slopes)}
@@ -195,7 +195,7 @@ def test_windows_do_not_jump_where_the_alignment_of_pulses_does(problem, nearby)
     base, longer = (np.clip((time - 450) / (flat + x), 0, 1) for x in (0.0, 1.0))
     base, slope = base.astype(np.float32), (longer - base).astype(np.float32)
     centre = np.zeros(2)
-    slopes = {0: Derivative(slope, centre, half_maxima(base, np.zeros(len(base))))}
+    slopes = {0: Derivative(slope, centre, half_maxima(base))}
     one = problem(weights=[np.eye(2)])
     one = replace(one, nearby=Nearby(nearby.simulator, centre, base, slopes))
 
@@ -210,3 +210,43 @@ def test_windows_do_not_jump_where_the_alignment_of_pulses_does(problem, nearby)
         # a jump by a sample is 0.01; the scale to a highest value of 1 changes by 1e-4
         assert there == pytest.approx(here + x * (one_more - here), abs=2e-4)
     assert (prepared(0.3).align_sample != prepared(0.0).align_sample).any()
+
+
+def names_of(functions: SlicedJoint) -> list[str]:
+    return [*chain.from_iterable(functions.names.values())]
+
+
+def values_of(functions, words):
+    """Values of the functions whose names begin so, for the measured pulses."""
+    chosen = [i for i, name in enumerate(names_of(functions)) if name.startswith(words)]
+    assert chosen
+    return functions.data[:, chosen]
+
+
+def test_slices_multiply_components_and_amplitudes(functions):
+    """All slices are numbers of the drift time times what is sliced."""
+    second, third = (
+        functions.data[:, names_of(functions).index(f"component {c}")] for c in (2, 3)
+    )
+    slices = [values_of(functions, f"component {c}, slice") for c in (2, 3)]
+    np.testing.assert_allclose(
+        slices[0] * third[:, None], slices[1] * second[:, None], atol=1e-9
+    )
+    some = np.abs(second) > 0.1
+    shares = slices[0][some] / second[some, None]
+    amplitude = values_of(functions, "current amplitude, bin 3, slice")[some]
+    k = shares.argmax(axis=1)[:, None]
+    bins = np.take_along_axis(amplitude / shares.clip(1e-12), k, 1)
+    np.testing.assert_allclose(amplitude, bins * shares, atol=1e-9)
+    assert bins.min() >= 0
+    assert bins.max() <= 1
+
+
+def test_wider_functions_see_pulses_far_from_the_data(functions):
+    """Narrow bins would all be empty, and have no derivatives."""
+    sides, wide = functions.sides, SlicedJoint(functions.sides, 16.0)
+    shape = functions._shape(sides.data)
+    shape[:, -1] = 10.0  # drift times in their robust standard deviations
+    near, far = (one._sliced(shape, sides.data)[0][0] for one in (functions, wide))
+    assert near.max() < 1e-6
+    assert far.max() > 1e-2

@@ -29,7 +29,7 @@ def simulator(tmp_path_factory):
 
 def laid_over(pulses, others):
     """Pulses moved so that they pass half of their height where the others do."""
-    at, there = (half_maxima(some, np.zeros(len(pulses))) for some in (pulses, others))
+    at, there = (half_maxima(some) for some in (pulses, others))
     return move(pulses, at - there)
 
 
@@ -77,7 +77,7 @@ def test_only_derivatives_from_afar_are_simulated_again():
 def test_pulses_are_moved_where_they_are_told(width, samples):
     time = np.arange(200.0)
     pulse = (1 / (1 + np.exp(-(time - 100.3) / width)))[np.newaxis].astype(np.float32)
-    assert half_maxima(pulse, np.zeros(1))[0] == pytest.approx(100.3, abs=0.1)
+    assert half_maxima(pulse)[0] == pytest.approx(100.3, abs=0.1)
     moved = move(pulse, np.array([samples]))
     wanted = 1 / (1 + np.exp(-(time + samples - 100.3) / width))
     inside = slice(10, 180)

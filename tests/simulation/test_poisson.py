@@ -8,13 +8,14 @@ import pytest
 from scipy.constants import elementary_charge, epsilon_0
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.fields import depletion_voltage, electric_field
+from cpunet.simulation.fields import electric_field
 from cpunet.simulation.geometry import Detector, RegionArray
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.outline import GERMANIUM
 from cpunet.simulation.poisson import (
     EPSILON_GERMANIUM,
     VOLT_PER_MM2,
+    depletion_voltage,
     make_grid,
     solve_potentials,
     surface_charges,
