@@ -35,40 +35,24 @@ from cpunet.simulation.simulator import cluster_hits
 def crystal(**changed: float) -> Detector:
     """The crystal of the Geant4 reference: a cylinder with a bore."""
     values: dict[str, float] = {
-        "crystal_length": 96.0,
-        "crystal_radius": 40.5,
-        "bore_length": 69.9,
-        "bore_radius": 5.0,
-        "wrap_around_radius": 14.0,
-        "point_contact_length": 2.0,
-        "point_contact_radius": 2.3,
-        "li_thickness": 1.0,
-        "impurity_z0_1e10_per_cm3": -1.8,
-        "bias_V": 4000.0,
+        "crystal_length": 96.0, "crystal_radius": 40.5, "bore_length": 69.9, "bore_radius": 5.0,
+        "wrap_around_radius": 14.0, "point_contact_length": 2.0, "point_contact_radius": 2.3,
+        "li_thickness": 1.0, "impurity_z0_1e10_per_cm3": -1.8, "bias_V": 4000.0,
         "temperature_K": 90.0,
-    }
+    }  # fmt: skip
     return Detector.model_validate(values | changed)
 
 
 FEP = EnergyWindow("FEP", 2613.5, 2615.5)
-LINES = {
-    EnergyWindow("DEP", 1591.0, 1594.0): 1500,
-    EnergyWindow("SEP", 2102.0, 2105.0): 800,
-    FEP: 800,
-}
+DEP, SEP = EnergyWindow("DEP", 1591.0, 1594.0), EnergyWindow("SEP", 2102.0, 2105.0)
+LINES = {DEP: 1500, SEP: 800, FEP: 800}
 # Geant4 11.4, option0: hit, FEP, SEP, DEP per gamma in the cone
 GEANT4 = {20: (0.4265, 0.0997, 0.01131, 0.00370), 100: (0.4450, 0.1101, 0.01199, 0.00386)}
 
 
 def run(height: float, n: int, seed: int = 3, **more: object) -> tuple[Hits, int]:
-    return simulate_gammas(
-        crystal(),
-        source_height_mm=height,
-        source_radius_mm=5,
-        n_primaries=n,
-        seed=seed,
-        **more,  # type: ignore[arg-type]
-    )
+    how = {"source_height_mm": height, "source_radius_mm": 5, "n_primaries": n, "seed": seed}
+    return simulate_gammas(crystal(), **how, **more)  # type: ignore[arg-type]
 
 
 def spectrum(height: float, n: int) -> npt.NDArray[np.float64]:
