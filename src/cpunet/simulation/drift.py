@@ -144,8 +144,8 @@ def velocity_factor(field_V_per_cm: npt.ArrayLike, low: float, high: float) -> F
 @kernel(inline="always")
 def carrier_velocity(
     coefficients: FloatArray, per_field: float, carrier: int, ex: float, ey: float, ez: float
-) -> tuple[float, float, float, float, float, float]:
-    r"""Velocity (mm/ns), field strength (V/cm), <100> speed and its slope of one charge.
+) -> tuple[float, float, float, float, float]:
+    r"""Velocity (mm/ns) of a charge, field strength (V/cm), and slope of the speed along <100>.
 
     With the direction :math:`n_i = E_i/|E|` of the field, :math:`S_k = \sum_i n_i^k` and the
     coefficients :math:`a`, :math:`b`, :math:`c` of `velocity_table`,
@@ -158,7 +158,7 @@ def carrier_velocity(
     """
     strength = math.sqrt(ex * ex + ey * ey + ez * ez)
     if strength <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        return 0.0, 0.0, 0.0, 0.0, 0.0
     nx, ny, nz = ex / strength, ey / strength, ez / strength
     position = strength * per_field
     row = min(int(position), coefficients.shape[1] - 2)
@@ -170,7 +170,6 @@ def carrier_velocity(
     b_mean = 4 * (low[B_MEAN] + part * (high[B_MEAN] - low[B_MEAN]))
     c_mean = 6 * (low[C_MEAN] + part * (high[C_MEAN] - low[C_MEAN]))
     slope = (high[V100] - low[V100]) * per_field
-    speed = low[V100] + part * (high[V100] - low[V100])
     x2, y2, z2 = nx * nx, ny * ny, nz * nz
     x4, y4, z4 = x2 * x2, y2 * y2, z2 * z2
     s4 = x4 + y4 + z4
@@ -180,7 +179,7 @@ def carrier_velocity(
     vx = sign * nx * (common + b_mean * x2 + c_mean * x4)
     vy = sign * ny * (common + b_mean * y2 + c_mean * y4)
     vz = sign * nz * (common + b_mean * z2 + c_mean * z4)
-    return vx, vy, vz, strength, speed, slope
+    return vx, vy, vz, strength, slope
 
 
 # Columns of `DriftMaps.values`.
@@ -584,7 +583,7 @@ def drift(
         if collected:
             break
         per_r = er / r if r > 0.0 else 0.0
-        vx, vy, vz, strength, _, slope = carrier_velocity(
+        vx, vy, vz, strength, slope = carrier_velocity(
             maps.coefficients, maps.fields_per_V_per_cm, carrier, per_r * x, per_r * y, ez
         )
         now = math.sqrt(vx * vx + vy * vy + vz * vz)
