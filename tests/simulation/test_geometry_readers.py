@@ -43,9 +43,7 @@ DIODE: dict[str, Any] = {
         "radius_in_mm": 35.0,
         "groove": {"depth_in_mm": 2.0, "radius_in_mm": {"outer": 10.5, "inner": 7.5}},
         "pp_contact": {"radius_in_mm": 7.5, "depth_in_mm": 0},
-        "taper": {
-            end: {"angle_in_deg": a, "height_in_mm": h} for end, (a, h) in TAPERS.items()
-        },
+        "taper": {end: {"angle_in_deg": a, "height_in_mm": h} for end, a, h in TAPERS},
     },
     "characterization": {
         "manufacturer": {"recommended_voltage_in_V": 3500, "dl_thickness_in_mm": 0.7}
