@@ -25,8 +25,8 @@ from streaming import write_fast_run
 
 from cpunet.recipes import load_recipe
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import GammaSource, energy_windows
 from cpunet.simulation.hits import Hits
+from cpunet.simulation.simulate import GammaSource, energy_windows
 
 ROOT = Path(__file__).resolve().parents[1]
 POOL = 500  # different events; the file repeats them

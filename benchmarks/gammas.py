@@ -11,9 +11,9 @@ import time
 
 import numpy as np
 
-from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
+from cpunet.simulation.gammas import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
+from cpunet.simulation.simulator import cluster_hits
 
 N_EVENTS = 3_000
 DEP = {EnergyWindow("DEP", 1591.0, 1594.0): N_EVENTS}

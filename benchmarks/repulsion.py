@@ -18,10 +18,16 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.drift import FWHM_PER_SIGMA, cloud_after_step, repulsion_constant
-from cpunet.simulation.field_lookup import HOLE, carrier_velocity, velocity_table
+from cpunet.simulation.drift import (
+    FWHM_PER_SIGMA,
+    HOLE,
+    carrier_velocity,
+    cloud_after_step,
+    repulsion_constant,
+    velocity_table,
+)
 from cpunet.simulation.hits import Hits
+from cpunet.simulation.simulator import cluster_hits
 
 Values = npt.NDArray[np.float64]
 ENERGIES_KEV = (100, 200, 400, 700, 1000, 1400, 2000)

@@ -12,13 +12,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.ndimage import gaussian_filter1d
 
-from cpunet.simulation.clustering import merge_hits
-from cpunet.simulation.gammas.sample import EnergyWindow
+from cpunet.simulation.gammas import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import Shift, SimulationSettings
-from cpunet.simulation.simulator import Simulator
+from cpunet.simulation.simulate import GammaSource
+from cpunet.simulation.simulator import Simulator, merge_hits
 
 EVENTS = 500
 SHIFTS = (

@@ -10,7 +10,7 @@ import time
 import numba
 import numpy as np
 
-from cpunet.simulation.gammas.sample import simulate_gammas
+from cpunet.simulation.gammas import simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits

@@ -29,12 +29,11 @@ from reboost.hpge import psd, utils
 
 from cpunet.legend.currents import PEAK, currents_about_peak
 from cpunet.legend.translate_library import TemplateTranslator
-from cpunet.simulation.clustering import cluster_hits
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulator import Simulator
+from cpunet.simulation.simulator import Simulator, cluster_hits
 from cpunet.translation.translator import REN
 
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)

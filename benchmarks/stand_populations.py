@@ -16,11 +16,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.stand import Side
-from cpunet.simulation.clustering import cluster_hits
-from cpunet.simulation.gammas.sample import EnergyWindow
+from cpunet.simulation.gammas import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
-from cpunet.simulation.hit_sources import GammaSource
 from cpunet.simulation.settings import Shift, SimulationSettings
+from cpunet.simulation.simulate import GammaSource
+from cpunet.simulation.simulator import cluster_hits
 
 FEP = EnergyWindow("FEP", 2609.511, 2619.511)
 NAMES = ("radius", "height", "spread in r", "spread in z", "sites", "largest site's share")

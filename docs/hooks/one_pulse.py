@@ -14,7 +14,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.parameters import pulse_parameters
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
-from cpunet.simulation.gammas.sample import EnergyWindow, simulate_gammas
+from cpunet.simulation.gammas import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits

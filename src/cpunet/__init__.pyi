@@ -20,8 +20,8 @@ from cpunet.pulses.reading.files import FileOptions as FileOptions
 from cpunet.pulses.reading.files import PulseFile as PulseFile
 from cpunet.pulses.reading.files import ReadOptions as ReadOptions
 from cpunet.recipes import list_recipes as list_recipes
-from cpunet.simulation.hit_sources import HitFile as HitFile
 from cpunet.simulation.hits import HitOptions as HitOptions
+from cpunet.simulation.simulate import HitFile as HitFile
 from cpunet.simulation.simulate import Simulation as Simulation
 from cpunet.simulation.simulate import simulate as simulate
 from cpunet.training.check import check as check

@@ -1,23 +1,26 @@
-"""The comparison that chain and physics minimise together, where the answer is known."""
+"""The comparison that chain and physics minimise together, and pulses near simulated ones."""
 
 from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from itertools import chain
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from cpunet.calibration.identifiability import Linear
-from cpunet.calibration.joint_problem import JointProblem, first
-from cpunet.calibration.nearby import Derivative, Nearby, half_maxima
+from cpunet.calibration.joint_problem import JointProblem, SlicedJoint, first
+from cpunet.calibration.nearby import Derivative, Nearby, Simulator, half_maxima, move
 from cpunet.calibration.nuisances import Physics, named
-from cpunet.calibration.sliced_functions import SlicedJoint
 from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.chain_fit import Fitter, fit_chain
 from cpunet.training.chain_parameters import with_decay, with_settings
@@ -49,7 +52,7 @@ def nearby() -> Nearby:
     """Two physics: a drift that takes longer, and a wider cloud."""
     fine = charge(N, seed=1)
     base = coarse(fine)
-    half = half_maxima(base, np.zeros(N))
+    half = half_maxima(base)
     wider = sum(np.roll(base, shift, axis=1) for shift in (-1, 1)) - 2 * base
     slopes, at = (coarse(faster(fine, 0.9)) - base, wider), np.zeros(2)
     derivatives = {i: Derivative(np.float32(s), at, half) for i, s in enumerate(slopes)}
@@ -195,7 +198,7 @@ def test_windows_do_not_jump_where_the_alignment_of_pulses_does(problem, nearby)
     base, longer = (np.clip((time - 450) / (flat + x), 0, 1) for x in (0.0, 1.0))
     base, slope = base.astype(np.float32), (longer - base).astype(np.float32)
     centre = np.zeros(2)
-    slopes = {0: Derivative(slope, centre, half_maxima(base, np.zeros(len(base))))}
+    slopes = {0: Derivative(slope, centre, half_maxima(base))}
     one = problem(weights=[np.eye(2)])
     one = replace(one, nearby=Nearby(nearby.simulator, centre, base, slopes))
 
@@ -210,3 +213,114 @@ def test_windows_do_not_jump_where_the_alignment_of_pulses_does(problem, nearby)
         # a jump by a sample is 0.01; the scale to a highest value of 1 changes by 1e-4
         assert there == pytest.approx(here + x * (one_more - here), abs=2e-4)
     assert (prepared(0.3).align_sample != prepared(0.0).align_sample).any()
+
+
+def names_of(functions: SlicedJoint) -> list[str]:
+    return [*chain.from_iterable(functions.names.values())]
+
+
+def values_of(functions, words):
+    """Values of the functions whose names begin so, for the measured pulses."""
+    chosen = [i for i, name in enumerate(names_of(functions)) if name.startswith(words)]
+    assert chosen
+    return functions.data[:, chosen]
+
+
+def test_slices_multiply_components_and_amplitudes(functions):
+    """All slices are numbers of the drift time times what is sliced."""
+    second, third = (
+        functions.data[:, names_of(functions).index(f"component {c}")] for c in (2, 3)
+    )
+    slices = [values_of(functions, f"component {c}, slice") for c in (2, 3)]
+    np.testing.assert_allclose(
+        slices[0] * third[:, None], slices[1] * second[:, None], atol=1e-9
+    )
+    some = np.abs(second) > 0.1
+    shares = slices[0][some] / second[some, None]
+    amplitude = values_of(functions, "current amplitude, bin 3, slice")[some]
+    k = shares.argmax(axis=1)[:, None]
+    bins = np.take_along_axis(amplitude / shares.clip(1e-12), k, 1)
+    np.testing.assert_allclose(amplitude, bins * shares, atol=1e-9)
+    assert bins.min() >= 0
+    assert bins.max() <= 1
+
+
+def test_wider_functions_see_pulses_far_from_the_data(functions):
+    """Narrow bins would all be empty, and have no derivatives."""
+    sides, wide = functions.sides, SlicedJoint(functions.sides, 16.0)
+    shape = functions._shape(sides.data)
+    shape[:, -1] = 10.0  # drift times in their robust standard deviations
+    near, far = (one._sliced(shape, sides.data)[0][0] for one in (functions, wide))
+    assert near.max() < 1e-6
+    assert far.max() > 1e-2
+
+
+FREE = [named(name) for name in ("temperature", "impurity", "self_repulsion")]
+
+
+@pytest.fixture(scope="module")
+def simulator(tmp_path_factory):
+    detector = read_detector("ppc", ["grid_mm=0.5"])
+    rng = np.random.default_rng(2)
+    place = rng.uniform([-12, -12, 5], [12, 12, 30], (30, 3))
+    hits = Hits.of(place, rng.uniform(200, 1000, 30), np.arange(0, 31, 3))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
+        yield Simulator(hits, Physics(detector, SimulationSettings(dt_ns=4), tuple(FREE)))
+
+
+def laid_over(pulses, others):
+    """Pulses moved so that they pass half of their height where the others do."""
+    at, there = (half_maxima(some) for some in (pulses, others))
+    return move(pulses, at - there)
+
+
+def test_small_changes_are_those_of_a_simulation(simulator):
+    nearby = Nearby.about(simulator, np.zeros(3)).again(range(3))
+    there = np.array([0.4, -0.008, 0.3])
+    exact = simulator(there)
+    near = nearby.at(there)
+    change = laid_over(exact, nearby.base) - nearby.base
+    left = laid_over(near, nearby.base) - laid_over(exact, nearby.base)
+    assert np.sqrt((left**2).mean()) < 0.25 * np.sqrt((change**2).mean())
+
+
+def test_derivatives_follow_the_edge(simulator):
+    """Edges of a warmer detector are later, and self-repulsion smears them there."""
+    warmer = np.array([0.5, 0.0, 0.0])
+    fresh = Nearby.about(simulator, warmer).again([2])
+    before = Nearby.about(simulator, np.zeros(3)).again([2])
+    nearby = Nearby.about(simulator, warmer, before.derivatives)
+    late = nearby.half - nearby.derivatives[2].half
+    assert late.max() > 0.3  # samples
+    far = np.argmax(late)
+    followed, stale = (
+        np.linalg.norm(slopes[far] - fresh.slopes[2][far])
+        for slopes in (nearby.slopes[2], nearby.derivatives[2].pulses)
+    )
+    assert followed < 0.5 * stale
+
+
+def test_only_derivatives_from_afar_are_simulated_again():
+    base, far, reach = np.zeros((4, 2)), np.array([2.0, 0.1, 0.0]), np.ones(3)
+    near = np.array([1.5, 0.1, 0.0])
+    known = {
+        0: Derivative(base, near, np.zeros(4)),
+        1: Derivative(base, np.zeros(3), np.zeros(4)),
+        2: Derivative(base[:3], far, np.zeros(3)),
+    }
+    nearby = Nearby(None, far, base, known)
+    assert nearby.outdated([0, 1, 2], reach, 4) == [1, 2]  # the last of too few events
+    assert nearby.outdated([1], reach, 4) == []  # what is not free does not count
+    assert Nearby(None, far, base, {}).outdated([0], reach) == [0]
+
+
+@given(st.floats(1, 8), st.floats(-6, 6))
+def test_pulses_are_moved_where_they_are_told(width, samples):
+    time = np.arange(200.0)
+    pulse = (1 / (1 + np.exp(-(time - 100.3) / width)))[np.newaxis].astype(np.float32)
+    assert half_maxima(pulse)[0] == pytest.approx(100.3, abs=0.1)
+    moved = move(pulse, np.array([samples]))
+    wanted = 1 / (1 + np.exp(-(time + samples - 100.3) / width))
+    inside = slice(10, 180)
+    assert np.abs(moved[0] - wanted)[inside].max() < 0.05 / width**2 + 1e-4

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.simulation.field_lookup import (
+from cpunet.simulation.drift import (
     ELECTRON,
     HOLE,
     carrier_velocity,
@@ -83,8 +83,8 @@ def test_cubic_symmetry(x: float, y: float, z: float) -> None:
 
 
 def test_factors_hold_below_and_above_and_change_smoothly_in_between() -> None:
-    factors = ((1.0, 1.0), (0.9, 1.2))
-    own, scaled = velocity_table(90), velocity_table(90, factors)
+    factors = {"hole_velocity_low_factor": 0.9, "hole_velocity_high_factor": 1.2}
+    own, scaled = velocity_table(90), velocity_table(90, STEPS.model_copy(update=factors))
     directions = np.array([[1, 0, 0], [1, 1, 0], [1, 1, 1]]) / np.sqrt([[1], [2], [3]])
     for strength, factor in ((100.0, 0.9), (500.0, 1.05), (2000.0, 1.2)):
         for direction in directions:

@@ -52,42 +52,26 @@ TEN, TWENTY = math.radians(10), math.radians(20)
 BORE_END = ICPC.crystal_length - ICPC.bore_length + ICPC.bore_radius
 
 
-@pytest.mark.parametrize(
-    ("change", "place", "inwards"),
-    [
-        ({}, (ICPC.crystal_radius, 30.0), (-1, 0)),
-        (
-            {},
-            (5 * math.sin(0.7), BORE_END - 5 * math.cos(0.7)),
-            (math.sin(0.7), -math.cos(0.7)),
-        ),
-        (
-            LONG | {"outer_taper_length": 30},
-            (ICPC.crystal_radius - 15 * math.tan(TEN), ICPC.crystal_length - 15),
-            (-math.cos(TEN), -math.sin(TEN)),
-        ),
-        (
-            LONG | {"inner_taper_length": 30},
-            (ICPC.bore_radius + 15 * math.tan(TEN), ICPC.crystal_length - 15),
-            (math.cos(TEN), -math.sin(TEN)),
-        ),
-        (
-            LONG | {"bottom_taper_length": 20, "bottom_taper_angle_deg": 20},
-            (ICPC.crystal_radius - 10 * math.tan(TWENTY), 10),
-            (-math.cos(TWENTY), math.sin(TWENTY)),
-        ),
-        (CYLINDERS, (33.0, 90.0), (-1, 0)),  # wall of the upper cylinder
-        (CYLINDERS, (38.0, 76.0), (0, -1)),  # step below it
-        (CYLINDERS, (36.0, 12.0), (-1, 0)),  # wall of the lower cylinder
-        (
-            CYLINDERS,
-            (36 + 4.45 / 2, 28.0),
-            (-6 / math.hypot(6, 4.45), 4.45 / math.hypot(6, 4.45)),
-        ),
-        (CYLINDERS, (19.0, 92.0), (1, 0)),  # wall of the groove
-        (CYLINDERS, (12.0, 87.0), (0, -1)),  # its floor
-    ],
-)
+R, L, BORE = ICPC.crystal_radius, ICPC.crystal_length, ICPC.bore_radius
+SLOPE = math.hypot(6, 4.45)  # of the transition, 6 mm along the axis
+
+
+@pytest.mark.parametrize(("change", "place", "inwards"), [
+    ({}, (R, 30.0), (-1, 0)),
+    ({}, (5 * math.sin(0.7), BORE_END - 5 * math.cos(0.7)), (math.sin(0.7), -math.cos(0.7))),
+    (LONG | {"outer_taper_length": 30}, (R - 15 * math.tan(TEN), L - 15),
+     (-math.cos(TEN), -math.sin(TEN))),
+    (LONG | {"inner_taper_length": 30}, (BORE + 15 * math.tan(TEN), L - 15),
+     (math.cos(TEN), -math.sin(TEN))),
+    (LONG | {"bottom_taper_length": 20, "bottom_taper_angle_deg": 20},
+     (R - 10 * math.tan(TWENTY), 10), (-math.cos(TWENTY), math.sin(TWENTY))),
+    (CYLINDERS, (33.0, 90.0), (-1, 0)),  # wall of the upper cylinder
+    (CYLINDERS, (38.0, 76.0), (0, -1)),  # step below it
+    (CYLINDERS, (36.0, 12.0), (-1, 0)),  # wall of the lower cylinder
+    (CYLINDERS, (36 + 4.45 / 2, 28.0), (-6 / SLOPE, 4.45 / SLOPE)),
+    (CYLINDERS, (19.0, 92.0), (1, 0)),  # wall of the groove
+    (CYLINDERS, (12.0, 87.0), (0, -1)),  # its floor
+])  # fmt: skip
 def test_lithium_is_as_thick_as_said(change, place, inwards) -> None:
     detector = changed(**change)
     for depth, inside, active in ((-0.01, 0, 0), (0.01, 1, 0), (0.99, 1, 0), (1.01, 1, 1)):
@@ -121,20 +105,19 @@ def test_impurities_follow_their_terms() -> None:
     assert radial.impurity_1e10_per_cm3(r, 0) == pytest.approx(-1.8 * 1.5 - 0.1)
 
 
+NO_BORE = dict.fromkeys(("bore_length", "bore_radius", "bore_bullet_radius"), 0)
+NO_DITCH = dict.fromkeys(("wrap_around_radius", "ditch_depth", "ditch_thickness"), 0)
+
+
 @pytest.mark.parametrize(
     ("values", "key"),
     [
         ({"bore_length": 94.0}, "bore_length .* reaches the point contact"),
         (
-            {"bore_length": 0, "bore_radius": 0, "bore_bullet_radius": 0}
-            | {"point_contact_length": 94.5},
-            r"error, li_thickness reaches the point contact \(point_contact_length\)",
+            NO_BORE | {"point_contact_length": 94.5},
+            "error, li_thickness reaches the point cont",
         ),
-        (
-            {"wrap_around_radius": 0, "ditch_depth": 0, "ditch_thickness": 0}
-            | {"point_contact_radius": 39.6},
-            "point_contact_radius reaches the lithium",
-        ),
+        (NO_DITCH | {"point_contact_radius": 39.6}, "point_contact_radius reaches the lithium"),
         ({"bore_bullet_radius": 6}, "bore_bullet_radius"),
         ({"point_contact_radius": 11.5}, "point_contact_radius"),
         ({"wrap_around_radius": 40}, "wrap_around_radius"),

@@ -34,6 +34,7 @@ xtal_grid 0.1; impurity_z0 -1.80; impurity_gradient 0.10; xtal_HV 4000
 drift_name ./drift_vel.dat; max_iterations 50000; xtal_temp 90
 """.replace("; ", "\n")
 IMPURITIES = "impurity_z0_1e10_per_cm3=-1"
+TAPERS = (("top", 45, 5), ("bottom", 0, 0))
 DIODE: dict[str, Any] = {
     "name": "B99000A",
     "type": "bege",
@@ -42,10 +43,7 @@ DIODE: dict[str, Any] = {
         "radius_in_mm": 35.0,
         "groove": {"depth_in_mm": 2.0, "radius_in_mm": {"outer": 10.5, "inner": 7.5}},
         "pp_contact": {"radius_in_mm": 7.5, "depth_in_mm": 0},
-        "taper": {
-            "top": {"angle_in_deg": 45, "height_in_mm": 5},
-            "bottom": {"angle_in_deg": 0, "height_in_mm": 0},
-        },
+        "taper": {end: {"angle_in_deg": a, "height_in_mm": h} for end, a, h in TAPERS},
     },
     "characterization": {
         "manufacturer": {"recommended_voltage_in_V": 3500, "dl_thickness_in_mm": 0.7}
@@ -262,10 +260,7 @@ def test_an_exponential_that_ends_before_the_detector(tmp_path: Path) -> None:
         ({"height": 30.0}, "unknown key geometry.height "),
         ({"height_in_cm": 3.0}, "unknown key geometry.height_in_cm"),
         ({"extra": {"hole": {"depth_in_mm": 3}}}, "geometry.extra.hole.depth_in_mm"),
-        (
-            {"extra": {"crack": {"radius_in_mm": 8, "width_in_mm": 22}}},
-            "geometry.extra.crack cuts off a side; only",
-        ),
+        ({"extra": {"crack": {"radius_in_mm": 8, "width_in_mm": 22}}}, "cuts off a side; only"),
     ],
 )
 def test_diodes_that_cannot_be_simulated(tmp_path, change: dict[str, Any], said: str) -> None:
@@ -274,21 +269,10 @@ def test_diodes_that_cannot_be_simulated(tmp_path, change: dict[str, Any], said:
     assert said in refused(written(tmp_path, "B.json", json.dumps(diode)), "temperature_K=90")
 
 
-BORED = """
-xtal_length 80  # z length; xtal_radius 35; pc_length 2; pc_radius 3
-wrap_around_radius 15; ditch_depth 2; ditch_thickness 3; hole_length 50
-hole_radius 5; hole_bullet_radius 2; inner_taper_length 45; taper_angle 5
-Li_thickness 1.0; impurity_z0 -1.0; impurity_gradient 0.02; xtal_HV 3500
-xtal_temp 90
-""".replace("; ", "\n")
-
-
 def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
     """The detector of the configuration, with lines added at its end or left out."""
-    lines = [line for line in BORED.splitlines() if not (without and line.startswith(without))]
-    path = folder / "D.config"
-    path.write_text("\n".join([*lines, more, ""]))
-    return read_detector(path)
+    lines = [line for line in SIGGEN.splitlines() if not (without and line.startswith(without))]
+    return read_detector(written(folder, "D.config", "\n".join([*lines, more, ""])))
 
 
 @pytest.mark.parametrize(
@@ -300,19 +284,19 @@ def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
         ("taper_length 4.5", "", "bottom_taper_length", 4.5),
         ("pc_radius 4", "", "point_contact_radius", 4),
         # lines that begin with a space are comments
-        (" pc_radius 4\n\tpc_radius 5", "", "point_contact_radius", 3),
+        (" pc_radius 4\n\tpc_radius 5", "", "point_contact_radius", 2.3),
         # as far as the ditch, where a larger one ends, and one of 0 is meant
-        ("pc_radius 14", "", "point_contact_radius", 12),
-        ("pc_radius 0", "", "point_contact_radius", 12),
+        ("pc_radius 14", "", "point_contact_radius", 11),
+        ("pc_radius 0", "", "point_contact_radius", 11),
         ("hole_bullet_radius 6", "", "bore_bullet_radius", 5),
         # a taper ends where the bottom of the hole is rounded, as wide as it was meant to be
-        ("inner_taper_length 60", "", "inner_taper_length", 48),
-        ("inner_taper_length 60", "", "inner_taper_angle_deg", 6.241112),
-        ("hole_bullet_radius 6", "", "inner_taper_length", 44),
-        ("hole_length_gap 32", "", "bore_length", 48),
+        ("inner_taper_length 68", "", "inner_taper_length", 64.9),
+        ("inner_taper_length 68", "", "inner_taper_angle_deg", 10.467333),
+        ("inner_taper_length 68\nhole_bullet_radius 6", "", "inner_taper_length", 63.9),
+        ("hole_length_gap 32", "", "bore_length", 64),
         ("pc_offset_x 0\nhole_offset_y_top 0.0", "", "bore_radius", 5),
         # no ditch: a wrap-around as far as the wall, or further, is none
-        ("wrap_around_radius 40", "ditch", "wrap_around_radius", 0),
+        ("wrap_around_radius 40.45", "ditch", "wrap_around_radius", 0),
     ],
 )
 def test_siggens_own_rules(tmp_path, more, without, field, value) -> None:
@@ -320,7 +304,8 @@ def test_siggens_own_rules(tmp_path, more, without, field, value) -> None:
 
 
 def test_widths_of_tapers_count_where_the_angle_is_0(tmp_path: Path) -> None:
-    more = "taper_angle 0\nouter_taper_length 20\nouter_taper_width 4\ninner_taper_width 2"
+    more = "taper_angle 0\nouter_taper_length 20\nouter_taper_width 4\n"
+    more += "inner_taper_length 45\ninner_taper_width 2"
     assert siggen(tmp_path, more).taper_slopes[:2] == pytest.approx((4 / 20, 2 / 45))
     slopes = siggen(tmp_path, more.replace("angle 0", "angle 5")).taper_slopes[:2]
     assert np.degrees(np.arctan(slopes)) == pytest.approx(5)
@@ -331,25 +316,25 @@ def test_widths_of_tapers_count_where_the_angle_is_0(tmp_path: Path) -> None:
 def test_radial_terms_need_a_power(tmp_path: Path) -> None:
     radial = "impurity_radial_add -0.4\nimpurity_radial_mult 1.5"
     for more in (radial, f"{radial}\nimpurity_rpower 0"):
-        assert siggen(tmp_path, more).impurity_1e10_per_cm3(35, 0) == pytest.approx(-1)
-    found = siggen(tmp_path, f"{radial}\nimpurity_rpower 2").impurity_1e10_per_cm3([0, 35], 0)
-    assert found == pytest.approx([-1, -1.5 - 0.4])
+        assert siggen(tmp_path, more).impurity_1e10_per_cm3(40.45, 0) == pytest.approx(-1.8)
+    found = siggen(tmp_path, f"{radial}\nimpurity_rpower 2")
+    found = found.impurity_1e10_per_cm3([0, 40.45], 0)
+    assert found == pytest.approx([-1.8, -1.8 * 1.5 - 0.4])
 
 
 def test_what_was_cut_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.INFO, "cpunet"):
         siggen(tmp_path, "pc_radius 14")
     (said,) = caplog.messages
-    assert "pc_radius is 12 mm, as in siggen: at most wrap_around_radius - ditch_th" in said
+    assert "pc_radius is 11 mm, as in siggen: at most wrap_around_radius - ditch_th" in said
 
 
 def legend(folder: Path, *extra: object) -> Detector:
     """A diode with a bore, and ``geometry.extra`` if it is given."""
     bore = {"borehole": {"radius_in_mm": 5, "depth_in_mm": 55}, "height_in_mm": 80}
     geometry = DIODE["geometry"] | bore | {"taper": {}} | ({"extra": extra[0]} if extra else {})
-    path = folder / "V99000A.json"
-    path.write_text(json.dumps(DIODE | {"type": "icpc", "geometry": geometry}))
-    return read_detector(path, [IMPURITIES])
+    text = json.dumps(DIODE | {"type": "icpc", "geometry": geometry})
+    return read_detector(written(folder, "V99000A.json", text), [IMPURITIES])
 
 
 @pytest.mark.parametrize(

@@ -11,12 +11,11 @@ import pytest
 from lgdo import Array, VectorOfVectors
 
 from cpunet.errors import CpunetError
-from cpunet.simulation import hit_sources
-from cpunet.simulation.gammas.sample import EnergyWindow
+from cpunet.simulation.gammas import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import describe_hits, read_hits
-from cpunet.simulation.hit_sources import HitFile
 from cpunet.simulation.hits import HitOptions, Hits
+from cpunet.simulation.simulate import HitFile
 from synthetic import one_line, write_table
 
 N = 12
@@ -237,7 +236,7 @@ def test_an_origin_in_m_of_an_array_of_one(tmp_path: Path) -> None:
 
 def test_blocks_hold_all_events_of_a_window(tmp_path, monkeypatch) -> None:
     file, detector = written(tmp_path, "vectors", steps()), read_detector("icpc")
-    monkeypatch.setattr(hit_sources, "BLOCK_EVENTS", 8)
+    monkeypatch.setattr("cpunet.simulation.simulate.BLOCK_EVENTS", 8)
     hits = read_hits(file)
     low = hits[hits.energy_kev < 1500]
     for windows, expected in (((), hits), ((EnergyWindow("some", 100, 1500),), low)):

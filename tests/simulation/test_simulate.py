@@ -18,14 +18,13 @@ from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
 from cpunet.settings import read_settings
-from cpunet.simulation.clustering import merge_hits
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
-from cpunet.simulation.hit_sources import GammaSource, HitFile, energy_windows
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulate import simulate
+from cpunet.simulation.simulate import GammaSource, HitFile, energy_windows, simulate
+from cpunet.simulation.simulator import merge_hits
 from synthetic import one_line
 
 SETTINGS = {"length_ns": 1600}
@@ -67,30 +66,30 @@ def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):
     events = {"FEP": 30, "SEP": 3, "DEP": 3}
     summary = simulate(out, detector=ppc, events=events, settings=SETTINGS, seed=4)
     assert summary.pulses == PulseFile(out)
-    assert summary.n_events == 36
-    assert summary.n_written + summary.without_signal == 36
-    assert summary.hits < summary.hits_before_merging
+    n = summary.counts
+    assert n["events_written"] + n["events_without_signal"] == n["events"] == 36
+    assert n["hits"] < n["hits_before_merging"]
     recipe = load_recipe("fast")
     selection = parse_selection("FEP", recipe.peaks)
     used = load_pulses(PulseFile(out), "simulated", recipe, selection).prepared
     assert len(used) >= summary.lines["FEP"] > 10
     pulses = next(open_pulses(out).blocks())
-    assert pulses.waveforms.shape == (summary.n_written, 100)
+    assert pulses.waveforms.shape == (n["events_written"], 100)
     assert pulses.dt_ns == 16
     assert pulses.waveforms[:, -1] == pytest.approx(1, abs=1e-3)
-    assert len(np.unique(pulses.event_number)) == summary.n_written
+    assert len(np.unique(pulses.event_number)) == n["events_written"]
 
 
 def test_events_do_not_depend_on_threads_but_on_the_seed(ppc, monkeypatch):
     def events(source: GammaSource) -> Hits:
         return Hits.concatenate(list(source.open(ppc).blocks))
 
-    monkeypatch.setattr("cpunet.simulation.hit_sources._ROUND_EVENTS", 10)
+    monkeypatch.setattr("cpunet.simulation.simulate._ROUND_EVENTS", 10)
     many = events(gammas())
     energy = np.round(many.energy_kev - 0.011, 1)
     assert [int((energy == e).sum()) for e in (2614.5, 2103.5, 1592.5)] == [30, 3, 3]
     assert np.all(np.diff(many.event_number) > 0)
-    monkeypatch.setattr("cpunet.simulation.hit_sources._MAX_WORKERS", 1)
+    monkeypatch.setattr("cpunet.simulation.simulate._MAX_WORKERS", 1)
     assert events(gammas()).edep_kev.tolist() == many.edep_kev.tolist()
     assert events(gammas(seed=5)).edep_kev.tolist() != many.edep_kev.tolist()
 
@@ -99,11 +98,10 @@ def test_energy_lost_in_the_lithium_layer_is_told(ppc, source, tmp_path: Path):
     out = tmp_path / "sim.lh5"
     summary = simulate(out, detector=ppc, hits=source, settings=SETTINGS | {"cluster_mm": 0})
     # of the events with numbers 0 to 3 the last two leave no charge that moves
-    assert (summary.n_events, summary.n_written, summary.without_signal) == (4, 2, 2)
-    assert (summary.hits_outside, summary.hits_in_contacts) == (1, 2)
+    assert (summary.counts["hits_outside"], summary.counts["hits_in_contacts"]) == (1, 2)
     assert "2 of 4 events written (0 FEP" in str(summary)
     assert "2 without any signal" in str(summary)
-    assert summary.lost_kev == pytest.approx(600 + 2614.5 + 500)
+    assert summary.counts["lost_kev"] == pytest.approx(600 + 2614.5 + 500)
     table = lh5.read("geds/sim", str(out))
     assert table["energy"].nda.tolist() == [1000, 600]
     assert table["lost_energy"].nda.tolist() == [0, 600]

@@ -1,4 +1,4 @@
-"""Pulses of hits: a planar detector on paper, trapping by Hecht's formula, reference pulses."""
+"""Pulses of hits (on paper, by Hecht's formula, reference pulses), and how hits are merged."""
 
 from __future__ import annotations
 
@@ -9,15 +9,16 @@ import numpy.typing as npt
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.ndimage import gaussian_filter1d
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.field_lookup import ELECTRON, HOLE, carrier_velocity, velocity_table
+from cpunet.simulation.drift import ELECTRON, HOLE, carrier_velocity, velocity_table
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulator import Simulator
+from cpunet.simulation.simulator import Simulator, cluster_hits
 
 PLAIN = SimulationSettings(dt_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0)
 SIGGEN = PLAIN.model_copy(
@@ -242,3 +243,56 @@ def test_quick_differences_are_the_exact_ones(values: dict[str, float]) -> None:
     exact = change(quick=False)
     error = np.sqrt(np.mean((change(quick=True) - exact) ** 2) / np.mean(exact**2))
     assert 0 < error < 0.1
+
+
+def hits_with(counts: list[int], seed: int = 0) -> Hits:
+    rng = np.random.default_rng(seed)
+    n = sum(counts)
+    return Hits.of(
+        rng.uniform(0, 40, (n, 3)),
+        rng.uniform(1, 500, n),
+        np.concatenate([[0], np.cumsum(counts)]),
+        np.arange(len(counts)) * 10,
+    )
+
+
+@given(st.lists(st.integers(0, 5), max_size=8), st.data())
+def test_picking_events_keeps_their_hits(counts: list[int], data: st.DataObject) -> None:
+    hits = hits_with(counts)
+    mask = np.array([data.draw(st.booleans()) for _ in counts], bool)
+    picked = hits[mask]
+    np.testing.assert_allclose(picked.energy_kev, hits.energy_kev[mask])
+    np.testing.assert_array_equal(picked.event_number, hits.event_number[mask])
+    np.testing.assert_array_equal(picked.x_mm, hits.x_mm[mask[hits.event_of_hit]])
+    both = Hits.concatenate([picked, hits[~mask]])
+    assert both.edep_kev.sum() == pytest.approx(hits.edep_kev.sum())
+    assert len(both) == len(hits)
+
+
+def event_of(n: int, seed: int) -> Hits:
+    rng = np.random.default_rng(seed)
+    return Hits.of(rng.uniform(0, 10, (n, 3)), rng.uniform(0.1, 900, n), [0, n])
+
+
+@given(st.integers(2, 30), st.integers(0, 10_000), st.floats(0, 20))
+def test_the_same_as_single_linkage(n: int, seed: int, distance: float) -> None:
+    hits = event_of(n, seed)
+    label = fcluster(linkage(hits.position_mm), distance, criterion="distance")
+    truth = np.sort(np.bincount(label, weights=hits.edep_kev)[1:])
+    np.testing.assert_allclose(np.sort(cluster_hits(hits, distance).edep_kev), truth)
+
+
+@given(st.lists(st.integers(0, 12), max_size=6), st.floats(0, 50))
+def test_energy_and_centre_of_each_event_stay(counts: list[int], distance: float) -> None:
+    hits = Hits.concatenate(
+        [Hits.of([], [], [0]), *(event_of(n, seed) for seed, n in enumerate(counts))]
+    )
+    merged = cluster_hits(hits, distance)
+    np.testing.assert_allclose(merged.energy_kev, hits.energy_kev, rtol=1e-12)
+    for axis in ("x_mm", "y_mm", "z_mm"):
+        before, after = (
+            np.bincount(h.event_of_hit, h.edep_kev * getattr(h, axis), minlength=len(counts))
+            for h in (hits, merged)
+        )
+        np.testing.assert_allclose(after, before, rtol=1e-9)
+    np.testing.assert_array_equal(merged.event_number, hits.event_number)

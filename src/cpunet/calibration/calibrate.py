@@ -21,7 +21,6 @@ from cpunet.calibration.calibrated_run import (
     Calibration,
     ExpectedErrors,
     Plan,
-    figures,
 )
 from cpunet.calibration.nearby import Simulator
 from cpunet.calibration.nuisances import Freedom, Physics, depletion, freedom, titled
@@ -43,8 +42,7 @@ from cpunet.pulses.reading.files import ALL, PulseFile, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed, yaml_text
-from cpunet.simulation.hit_sources import HitFile
-from cpunet.simulation.simulate import StoredSimulation, simulate
+from cpunet.simulation.simulate import HitFile, StoredSimulation, simulate
 from cpunet.training.chain_parameters import with_settings
 from cpunet.training.job import TrainingJob, train_chain
 from cpunet.training.pulse_sets import MIN_PULSES, PulseSets
@@ -211,8 +209,8 @@ def _calibrated(
             log.info(titled(note))
         detector, settings = physics.at(problem.coordinates)
         for file, config in ((DETECTOR, detector), (SETTINGS, settings)):
-            text = yaml_text(config.model_dump(mode="json"))
-            (folder / file).write_text(result.comment + text, encoding="utf-8")
+            text = result.comment + yaml_text(config.model_dump(mode="json"))
+            (folder / file).write_text(text, encoding="utf-8")
         # all events of the file
         hits, values = HitFile(pair[0].path, placed=True), dict(settings)
         simulate(folder / SIM, detector=detector, hits=hits, settings=values, seed=seed)
@@ -231,7 +229,7 @@ def _calibrated(
         }
         run.model_copy(update=facts).write(folder)
         (folder / CALIBRATION).write_text(result.model_dump_json(indent=1) + "\n")
-        for file, figure in figures(result).items():
+        for file, figure in result.figures.items():
             figure.savefig(folder / f"{file}.png", dpi=DPI)
     return Calibration.load(out)
 

@@ -164,25 +164,29 @@ class CalibratedPhysics(InfoPart):
     notes: list[str]
 
     @property
+    def figures(self) -> dict[str, Figure]:
+        """``pulls``, and ``directions`` if any parameter was free."""
+        drawn = {"pulls": pulls_figure(self)}
+        if self.directions:
+            drawn["directions"] = directions_figure(self.directions)
+        return drawn
+
+    @property
     def comment(self) -> str:
         """Comment on unreliable values, for the files of the physics."""
-        return "".join(
-            f"# {name}: unreliable value, makes up for something else ({parameter.doubt})\n"
-            for name, parameter in self.parameters.items()
-            if parameter.doubt
-        )
+        doubts = ((name, of.doubt) for name, of in self.parameters.items() if of.doubt)
+        text = "unreliable value, makes up for something else"
+        return "".join(f"# {name}: {text} ({doubt})\n" for name, doubt in doubts)
 
     @property
     def shown(self) -> dict[str, str]:
         """Each value with its error, or why none is given."""
-        pairs = {name for pair in self.together for name in pair.components}
-        texts = {}
+        texts = {n: f"{of.value:.5g} ± {of.error:.2g}" for n, of in self.parameters.items()}
+        for pair in self.together:
+            texts |= dict.fromkeys(pair.components, "determined only together with another")
         for name, of in self.parameters.items():
-            texts[name] = f"{of.value:.5g} ± {of.error:.2g}"
             if of.doubt:
                 texts[name] = f"unreliable value: {of.value:.5g} makes up for something else"
-            elif name in pairs:
-                texts[name] = "determined only together with another"
         return texts
 
     def __str__(self) -> str:
@@ -196,13 +200,12 @@ class CalibratedPhysics(InfoPart):
             f"{pair.error:.2g} (errors of the priors)"
             for pair in self.together
         ]
-        if self.fixed:
-            falls = ", ".join(
-                f"{titled(name)} (± {fixed.error_if_free:.2g} if free, chi-square would fall "
-                f"by {fixed.chi_square_would_fall_by:.1f})"
-                for name, fixed in self.fixed.items()
-            )
-            lines.append(f"left as simulated: {falls}")
+        falls = [
+            f"{titled(name)} (± {fixed.error_if_free:.2g} if free, chi-square would fall by "
+            f"{fixed.chi_square_would_fall_by:.1f})"
+            for name, fixed in self.fixed.items()
+        ]
+        lines += [f"left as simulated: {', '.join(falls)}"] if falls else []
         chi = self.chi_square
         before, after = chi.before / chi.moments, chi.after / chi.moments
         lines.append(f"chi-square per function {before:.2f} before, {after:.2f} after")
@@ -249,7 +252,7 @@ class Calibration(Run):
         """A row per free parameter: its value, error, simulated value, prior and others."""
         from pandas import DataFrame
 
-        rows = {name: of.model_dump() for name, of in self.result.parameters.items()}
+        rows = self.result.model_dump()["parameters"]
         return DataFrame.from_dict(rows, orient="index")
 
     @property
@@ -270,7 +273,7 @@ class Calibration(Run):
     @property
     def figures(self) -> dict[str, Figure]:
         """``pulls``, and ``directions`` if any parameter was free."""
-        return figures(self.result)
+        return self.result.figures
 
     def __str__(self) -> str:
         return f"{self.result}\n{self.folder}"
@@ -315,11 +318,9 @@ class Plan(InfoPart):
         """Expected errors: a row per parameter and kind, a column per number of pulses."""
         from pandas import DataFrame
 
-        rows = {
-            (name, kind): getattr(expected, kind)
-            for name, expected in self.errors_by_name.items()
-            for kind in ("alone", "all_free")
-        }
+        rows: dict[tuple[str, str], dict[str, float]] = {}
+        for name, of in self.errors_by_name.items():
+            rows |= {(name, "alone"): of.alone, (name, "all_free"): of.all_free}
         return DataFrame.from_dict(rows, orient="index")
 
     def plot(self) -> Figure:
@@ -346,12 +347,10 @@ class Plan(InfoPart):
                 errors = of.prior, *getattr(of, kind).values()
                 rows.append([titled(name), *(f"{error:.3g}" for error in errors)])
             lines.append(text_table([title, "prior", *counts], rows))
-        lines.append(
-            f"eigenvectors of the covariance with {MIDDLE} pulses of each side, error in "
-            "units of the prior:"
-        )
-        for of_axis in self.directions[MIDDLE]:
-            lines.append(f"{of_axis.error:8.3f}  {titled(of_axis.words, units=False)}")
+        title = f"eigenvectors of the covariance with {MIDDLE} pulses of each side"
+        lines.append(f"{title}, error in units of the prior:")
+        axes = self.directions[MIDDLE]
+        lines += [f"{axis.error:8.3f}  {titled(axis.words, units=False)}" for axis in axes]
         return "\n".join(lines)
 
     def __repr__(self) -> str:
@@ -362,25 +361,15 @@ BEFORE, AFTER = COLOURS["raw"], COLOURS["ren"]
 LINEAR = 3.0  # pulls up to which the axis is linear
 
 
-def figures(result: CalibratedPhysics) -> dict[str, Figure]:
-    """``pulls``, and ``directions`` if any parameter was free."""
-    drawn = {"pulls": pulls_figure(result)}
-    if result.directions:
-        drawn["directions"] = directions_figure(result.directions)
-    return drawn
-
-
 @styled
 def pulls_figure(result: CalibratedPhysics) -> Figure:
     """Pulls of all functions before and after a calibration."""
     figure = Figure(figsize=(9.5, 3.6))
     panel = figure.subplots()
     x = np.arange(len(result.functions))
-    for pulls, colour, label in (
-        (result.pulls_before, BEFORE, "as simulated, chain alone"),
-        (result.pulls_after, AFTER, "calibrated"),
-    ):
-        panel.plot(x, pulls, ".", ms=4, color=colour, label=label)
+    before, after = result.pulls_before, result.pulls_after
+    panel.plot(x, before, ".", ms=4, color=BEFORE, label="as simulated, chain alone")
+    panel.plot(x, after, ".", ms=4, color=AFTER, label="calibrated")
     panel.set_yscale("symlog", linthresh=LINEAR)
     panel.axhspan(-2, 2, color="0.9", zorder=0)
     sizes = np.array([*result.groups.values()])

@@ -12,20 +12,17 @@ contains the start time of a pulse. Derivatives from another point are moved wit
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 import numpy.typing as npt
-from numba import prange
 
 from cpunet.calibration.nuisances import Physics, Values
-from cpunet.kernels import kernel
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.simulator import Simulator as DetectorSimulator
+from cpunet.training.aligned import between, cubic, stretch
 
 FloatArray = npt.NDArray[np.float32]
 # Factors by which the sampling period is divided for alignment; the first possible is used.
@@ -35,55 +32,21 @@ FINER = (4, 5, 3, 2, 1)
 MOVED = 0.15
 
 
-@kernel(inline="always")
-def _sample(pulse: Any, at: int, length: int) -> Any:  # pragma: no cover - compiled
-    """Sample of a pulse; 0 before its start, its last sample after its end."""
-    if at < 0:
-        return np.float32(0.0)
-    return pulse[min(at, length - 1)]
-
-
-@kernel(parallel=True)
-def half_maxima(pulses: Any, otherwise: Any) -> Any:  # pragma: no cover - compiled
+def half_maxima(pulses: FloatArray, otherwise: Values | float = 0.0) -> Values:
     """Sample at which each pulse reaches half its final value; `otherwise` if it does not."""
-    halves = otherwise.copy()
-    for i in prange(len(pulses)):
-        pulse = pulses[i]
-        level = 0.5 * pulse[-1]
-        for j in range(1, len(pulse)):
-            if pulse[j] >= level > pulse[j - 1]:
-                halves[i] = j - 1 + (level - pulse[j - 1]) / (pulse[j] - pulse[j - 1])
-                break
-    return halves
+    level, rows = 0.5 * pulses[:, -1:], np.arange(len(pulses))
+    crossed = (pulses[:, 1:] >= level) & (level > pulses[:, :-1])
+    before = crossed.argmax(axis=1)
+    low, high = pulses[rows, before], pulses[rows, before + 1]
+    part = (level[:, 0].astype(float) - low) / np.where(high > low, high - low, 1)
+    return np.where(crossed.any(axis=1), before + part, otherwise)
 
 
-@kernel(parallel=True)
-def move(pulses: Any, samples: Any) -> Any:  # pragma: no cover - compiled
+def move(pulses: FloatArray, samples: Values) -> FloatArray:
     """Shift each pulse to the left by a number of samples, with cubic interpolation."""
-    moved = np.empty_like(pulses)
-    for i in prange(len(pulses)):
-        pulse, length = pulses[i], pulses.shape[1]
-        whole = math.floor(samples[i])
-        part = samples[i] - whole
-        for j in range(length):
-            a = _sample(pulse, j + whole - 1, length)
-            b = _sample(pulse, j + whole, length)
-            c = _sample(pulse, j + whole + 1, length)
-            d = _sample(pulse, j + whole + 2, length)
-            curved = 2 * a - 5 * b + 4 * c - d + part * (3 * (b - c) + d - a)
-            moved[i, j] = b + 0.5 * part * (c - a + part * curved)
-    return moved
-
-
-@kernel(parallel=True)
-def cut(pulses: Any, starts: Any, length: int) -> Any:  # pragma: no cover - compiled
-    """Windows of pulses, scaled to a highest value of 1."""
-    windows = np.empty((len(pulses), length), np.float32)
-    for i in prange(len(pulses)):
-        highest = pulses[i].max()
-        for j in range(length):
-            windows[i, j] = _sample(pulses[i], starts[i] + j, pulses.shape[1]) / highest
-    return windows
+    whole = np.floor(samples).astype(np.int64)
+    weights, _ = cubic(samples - whole)
+    return between(stretch(pulses, whole - 1, pulses.shape[1] + 3), weights)
 
 
 class Simulator:
@@ -121,8 +84,7 @@ class Simulator:
         detector, settings = self.physics.at(coordinates)
         if quick:
             settings = settings.model_copy(update={"dt_ns": settings.dt_ns / self.finer})
-        simulator = DetectorSimulator(detector, settings, quick=quick)
-        events = simulator.events(self._hits[:most])
+        events = DetectorSimulator(detector, settings, quick=quick).events(self._hits[:most])
         self.simulated()
         return events.waveforms
 
@@ -183,7 +145,7 @@ class Nearby:
             return self
         simulator, centre, derivatives = self.simulator, self.centre, {**self.derivatives}
         here, finer = simulator(centre, quick=True, most=most), simulator.finer
-        half = half_maxima(here, np.zeros(len(here)))
+        half = half_maxima(here)
         for i in of:
             nuisance = simulator.physics.nuisances[i]
             low, high = nuisance.bounds(simulator.physics.nominal(nuisance))
@@ -206,8 +168,7 @@ class Nearby:
     @cached_property
     def half(self) -> Values:
         """Half maxima of the pulses in samples."""
-        half: Values = half_maxima(self.base, np.zeros(len(self.base)))
-        return half
+        return half_maxima(self.base)
 
     @cached_property
     def slopes(self) -> Mapping[int, FloatArray]:

@@ -79,21 +79,15 @@ class Nuisance:
         >>> round(factor.value(2.0, math.log(1.1)), 6)
         2.2
         """
-        if self.kind == "factor":
-            value = nominal * math.exp(coordinate)
-        elif self.kind == "square":
-            value = math.sqrt(max(0.0, nominal**2 + coordinate))
-        else:
-            value = nominal + coordinate
-        return min(max(value, self.lowest), self.highest)
+        scale, back = _SCALES[self.kind]
+        return min(max(back(scale(nominal) + coordinate), self.lowest), self.highest)
 
     def coordinate(self, nominal: float, value: float) -> float:
         """Coordinate of a value."""
-        if self.kind == "factor":
-            return math.log(value / nominal)
-        return value**2 - nominal**2 if self.kind == "square" else value - nominal
+        scale, _ = _SCALES[self.kind]
+        return scale(value) - scale(nominal)
 
-    def slope(self, nominal: float, value: float) -> float:
+    def slope(self, value: float) -> float:
         """Derivative of the parameter with respect to its coordinate, to convert errors."""
         if self.kind == "square":
             # near 0: the increase by a step of the coordinate
@@ -102,10 +96,15 @@ class Nuisance:
 
     def bounds(self, nominal: float) -> tuple[float, float]:
         """Coordinates of the minimum and maximum value."""
-        low = max(self.lowest, 1e-9) if self.kind == "factor" else self.lowest
-        return self.coordinate(nominal, low), self.coordinate(nominal, self.highest)
+        return self.coordinate(nominal, self.lowest), self.coordinate(nominal, self.highest)
 
 
+# Scales on which a coordinate is added, and back.
+_SCALES: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = {
+    "added": (float, float),
+    "factor": (math.log, math.exp),
+    "square": (lambda value: value**2, lambda square: math.sqrt(max(0.0, square))),
+}
 # Parameters that are uncertain for any detector come first and are considered first. The others
 # are used only if these do not explain the data.
 NUISANCES = (
@@ -242,27 +241,22 @@ class Physics:
         of_detector, of_settings = self.detector.model_dump(), self.settings.model_dump()
         values = self.values(coordinates)
         for n, coordinate in zip(self.nuisances, coordinates, strict=True):
+            field = n.field or n.name
             if coordinate and n.name == "impurity_factor":
                 of_detector["impurity_scale"] *= values[n.name]
             elif coordinate:
-                field = n.field or n.name
                 (of_detector if field in of_detector else of_settings)[field] = values[n.name]
         sizes = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
-        source = (
-            f"detector {self.detector.name}: {sizes} is impossible; narrow a `prior`, "
-            "or leave any of them out of `free`"
-        )
-        return (
-            checked(Detector, of_detector, source),
-            checked(SimulationSettings, of_settings, source),
-        )
+        remedy = "narrow a `prior`, or leave any of them out of `free`"
+        source = f"detector {self.detector.name}: {sizes} is impossible; {remedy}"
+        settings = checked(SimulationSettings, of_settings, source)
+        return checked(Detector, of_detector, source), settings
 
     def in_own_unit(self, i: int, coordinate: float, error: float) -> tuple[float, float]:
         """Value of the parameter at position `i` at a coordinate, and its error."""
-        nuisance = self.nuisances[i]
-        nominal = self.nominal(nuisance)
+        nuisance, nominal = self.nuisances[i], self.nominal(self.nuisances[i])
         value = nuisance.value(nominal, coordinate)
-        return value, float(nuisance.slope(nominal, value) * error)
+        return value, float(nuisance.slope(value) * error)
 
     def priors(self, given: Mapping[str, tuple[float, float]]) -> tuple[Values, Values]:
         """Centres and widths of the coordinates before any data.
@@ -278,7 +272,7 @@ class Physics:
             if nuisance.name in given:
                 nominal, (value, error) = self.nominal(nuisance), given[nuisance.name]
                 centres[i] = nuisance.coordinate(nominal, value)
-                widths[i] = error / nuisance.slope(nominal, value)
+                widths[i] = error / nuisance.slope(value)
         return centres, widths
 
 

@@ -18,12 +18,10 @@ import numpy as np
 
 from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
 from cpunet.calibration.identifiability import Linear
-from cpunet.calibration.joint_problem import JointProblem, events, first
+from cpunet.calibration.joint_problem import JointProblem, SlicedJoint, events, first
 from cpunet.calibration.nearby import Nearby, Simulator
 from cpunet.calibration.nuisances import Values
-from cpunet.calibration.result import BEYOND_CHANCE, described
-from cpunet.calibration.sampling import of_parts, of_weights
-from cpunet.calibration.sliced_functions import SlicedJoint
+from cpunet.calibration.result import BEYOND_CHANCE, described, of_parts, of_weights
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe

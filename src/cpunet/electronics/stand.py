@@ -23,11 +23,10 @@ from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
 from cpunet.settings import Set, checked, key_values, read_json, require_seed
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_files import hit_columns
-from cpunet.simulation.hit_sources import GammaSource, wanted_events
-from cpunet.simulation.hit_tables import HIT_TABLE
+from cpunet.simulation.hit_files import HIT_TABLE, hit_columns
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import Shift, SimulationSettings, detector_and_settings
+from cpunet.simulation.simulate import GammaSource, wanted_events
 from cpunet.simulation.simulator import Simulator
 from cpunet.tables import counted
 

@@ -40,55 +40,44 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
     fields
         Field maps of the detector.
     """
-    ratio = detector.crystal_length / detector.crystal_radius
-    figure = Figure(figsize=(7.2, min(max(1.6 + 2.5 * ratio, 3.4), 7.5)))
+    radius, height = detector.crystal_radius, detector.crystal_length
+    figure = Figure(figsize=(7.2, min(max(1.6 + 2.5 * height / radius, 3.4), 7.5)))
     panels = figure.subplots(1, 2, sharex=True, sharey=True)
-    top, low = float(fields.potential_V.max()), _WEIGHTING_LEVELS[0]
-    maps: list[tuple[FloatArray, Any, str, dict[str, Any]]] = [
-        (
-            fields.potential_V,
-            np.linspace(0, top, 11)[1:-1],
-            f"Potential [V], lines every {top / 10:.0f} V",
-            {"cmap": "viridis", "vmin": 0, "vmax": top},
-        ),
-        (
-            np.maximum(fields.weighting_potential, low / 10),
-            _WEIGHTING_LEVELS,
-            f"Weighting potential, lines at {low} to {_WEIGHTING_LEVELS[-1]}",
-            {"cmap": "cividis", "norm": LogNorm(low / 10, 1)},
-        ),
-    ]
     # values of the germanium extend into the lithium layer and the ditch, so that no gap shows
     # at the edges of what is drawn there
     covered = np.isin(fields.region, (LI_CONTACT, DITCH))
     nearest = distance_transform_edt(covered, return_distances=False, return_indices=True)
-    for axes, (values, levels, label, colours) in zip(panels, maps, strict=True):
+
+    def draw(axes: Any, values: FloatArray, levels: Any, label: str, **colours: Any) -> None:
         grid = fields.r_mm, fields.z_mm, values[tuple(nearest)].T
         image = axes.pcolormesh(*grid, rasterized=True, **colours)
         axes.contour(*grid, levels, colors="white", linewidths=0.65, alpha=0.9)
-        figure.colorbar(
-            image, ax=axes, label=label, location="bottom", shrink=0.95, pad=0.02, aspect=25
-        )
-    r, z = np.meshgrid(
-        np.array([0.35, 0.75]) * detector.crystal_radius,
-        np.array([0.15, 0.5, 0.85]) * detector.crystal_length,
-    )
+        place: Any = {"location": "bottom", "shrink": 0.95, "pad": 0.02, "aspect": 25}
+        figure.colorbar(image, ax=axes, label=label, **place)
+
+    top, low = float(fields.potential_V.max()), _WEIGHTING_LEVELS[0]
+    label, levels = f"Potential [V], lines every {top / 10:.0f} V", np.linspace(0, top, 11)
+    draw(panels[0], fields.potential_V, levels[1:-1], label, cmap="viridis", vmin=0, vmax=top)
+    values, norm = np.maximum(fields.weighting_potential, low / 10), LogNorm(low / 10, 1)
+    label = f"Weighting potential, lines at {low} to {_WEIGHTING_LEVELS[-1]}"
+    draw(panels[1], values, _WEIGHTING_LEVELS, label, cmap="cividis", norm=norm)
+    r, z = np.meshgrid(radius * np.array([0.35, 0.75]), height * np.array([0.15, 0.5, 0.85]))
     # well away from the surfaces of the active germanium
-    margin = 0.05 * detector.crystal_radius
-    inside = detector.active(r + margin, z) & detector.active(np.maximum(r - margin, 0), z)
+    near, far = np.maximum(r - 0.05 * radius, 0), r + 0.05 * radius
+    inside = detector.active(near, z) & detector.active(far, z)
     r, z = r[inside], z[inside]
     electrons, holes = Simulator(detector, _SETTINGS, fields=fields).paths(r, 0.0, z)
     for carrier, colour in ((electrons, _ELECTRON), (holes, _HOLE)):
         for track in carrier:
             # a light outline keeps the line visible everywhere on the map
-            radius, height = np.hypot(track[:, 0], track[:, 1]), track[:, 2]
-            panels[0].plot(radius, height, color="white", linewidth=2.2, alpha=0.75)
-            panels[0].plot(radius, height, color=colour, linewidth=1.2)
+            path = np.hypot(track[:, 0], track[:, 1]), track[:, 2]
+            panels[0].plot(*path, color="white", linewidth=2.2, alpha=0.75)
+            panels[0].plot(*path, color=colour, linewidth=1.2)
     panels[0].plot(r, z, "o", color="white", markeredgecolor="black", markersize=4)
     # contacts and lithium layer filled, the outside and the ditch blank
-    step = max(detector.crystal_length, detector.crystal_radius) / _OUTLINE_POINTS
-    at_r = np.arange(0, 1.05 * detector.crystal_radius, step)
-    at_z = np.arange(-step, 1.05 * detector.crystal_length, step)  # the face has an outside
+    step = max(height, radius) / _OUTLINE_POINTS
+    at_r = np.arange(0, 1.05 * radius, step)
+    at_z = np.arange(-step, 1.05 * height, step)  # the face has an outside
     rr, zz = np.meshgrid(at_r, at_z)
     inside, region = detector.inside(rr, zz), detector.region(rr, zz)
     cover = np.full(rr.shape, np.nan)
@@ -101,10 +90,9 @@ def detector_figure(detector: Detector, fields: FieldMaps) -> Figure:
         axes.contour(
             at_r, at_z, inside.astype(float), [0.5], colors="black", linewidths=1.0, zorder=2.3
         )
-        axes.set(xlabel="r [mm]", aspect="equal")
         axes.grid(visible=False)
-        axes.set_xlim(0, detector.crystal_radius * 1.02)
-        axes.set_ylim(-0.01 * detector.crystal_length, detector.crystal_length * 1.01)
+        axes.set(xlim=(0, radius * 1.02), ylim=(-0.01 * height, height * 1.01))
+        axes.set(xlabel="r [mm]", aspect="equal")
     panels[0].set_ylabel("z [mm]")
     handles = [
         *(Patch(color=colour, label=name) for _, name, colour in _REGIONS),

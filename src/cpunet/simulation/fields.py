@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 import platformdirs
-from scipy.ndimage import binary_erosion, label, minimum_filter
+from scipy.ndimage import binary_erosion
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import written_aside
@@ -36,74 +36,17 @@ from cpunet.progress import stage
 from cpunet.pulses.reading.arrays import read_arrays
 from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
 from cpunet.simulation.outline import DITCH, GERMANIUM, LI_CONTACT
-from cpunet.simulation.poisson import Grid, Potentials, make_grid, on_nodes, solve_potentials
+from cpunet.simulation.poisson import (
+    HIGHEST_BIAS_V,
+    Grid,
+    Potentials,
+    has_pocket,
+    make_grid,
+    on_nodes,
+    solve_potentials,
+)
 
 log = logging.getLogger(__name__)
-
-# V: a pocket this shallow holds no charge (about kT/e at 90 K), and is not resolved by the
-# grid
-POCKET_DEPTH_V = 0.01
-HIGHEST_BIAS_V = 20_000.0
-_RESOLUTION_V = 0.5
-
-
-def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionArray) -> float:
-    r"""Smallest bias in V at which the potential has no pocket; infinite if there is none.
-
-    Parameters
-    ----------
-    bias, impurities
-        Potentials of a unit bias, and of the impurities in V, shape (nr, nz).
-    region
-        Region of each node, as from `Detector.region`.
-
-    Examples
-    --------
-    A planar detector of thickness :math:`d` depletes at :math:`e N d^2 / 2 \varepsilon`.
-
-    >>> import numpy as np
-    >>> z = np.tile(np.linspace(0, 10, 401), (3, 1))  # mm
-    >>> impurities = -10 * z * (10 - z) / 2  # e N / epsilon = 10 V / mm2
-    >>> region = np.where(z == 0, 0, np.where(z == 10, 1, 2))
-    >>> bool(abs(depletion_voltage(z / 10, impurities, region) - 500) < 5)
-    True
-    """
-    low, high = 0.0, HIGHEST_BIAS_V
-    if has_pocket(high * bias + impurities, region):
-        return float("inf")
-    if not has_pocket(impurities, region):
-        return 0.0
-    while high - low > _RESOLUTION_V:
-        middle = (low + high) / 2
-        pocket = has_pocket(middle * bias + impurities, region)
-        low, high = (middle, high) if pocket else (low, middle)
-    return high
-
-
-def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
-    """Whether `potential` (nr, nz), in V, keeps holes from reaching an electrode.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> r, z = np.meshgrid(np.arange(9), np.arange(9), indexing="ij")
-    >>> region = np.where(z == 0, 0, 2)
-    >>> has_pocket(z * 10.0, region), has_pocket((z - 4.0) ** 2, region)
-    (False, True)
-    """
-    minima = (potential <= minimum_filter(potential, size=3, mode="nearest")) & (
-        region == GERMANIUM
-    )
-    where = np.argwhere(minima)
-    for row, column in where[np.argsort(potential[minima])]:  # a true pocket is deep
-        start = potential[row, column]
-        basins, _ = label(potential <= start + POCKET_DEPTH_V, np.ones((3, 3)))
-        basin = basins == basins[row, column]
-        # below that level it leads neither to a contact nor to a lower node
-        if (region[basin] >= GERMANIUM).all() and (potential[basin] >= start).all():
-            return True
-    return False
-
 
 # part of the file name, so that results of an older solver are not used
 SOLVER_VERSION = 4
@@ -124,49 +67,7 @@ _LARGEST_SCALE = 1000.0
 _MAX_SHAPES = 4
 
 
-@dataclass(frozen=True, eq=False)
-class Superposition:
-    """Contributions of the bias, the impurities and a surface charge to the potential.
-
-    Parameters
-    ----------
-    grid, potentials
-        Nodes, and the parts of the potential at them, for impurities neither scaled nor tilted.
-    unit_depletion_V
-        Depletion voltage in V for an ``impurity_scale`` of 1; infinite above 20 kV.
-    """
-
-    grid: Grid
-    potentials: Potentials
-    unit_depletion_V: float
-
-    def total_V(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
-        r"""Potential (nr, nz) in V for a bias in V and scaled and tilted impurities.
-
-        .. math:: V = b\, w + s\, u + t\, v + q
-
-        The tilt is in 1e10/cm4. Where the detector is not depleted, this is not the true
-        potential.
-        """
-        parts = self.potentials
-        total = bias_V * parts.bias + impurity_scale * parts.impurities + parts.surface
-        return total + impurity_tilt * parts.tilt if impurity_tilt else total
-
-    def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
-        """Smallest bias in V that depletes the detector; infinite if none up to 20 kV does."""
-        alone = not self.potentials.surface.any() and impurity_tilt == 0
-        if alone and math.isfinite(self.unit_depletion_V):
-            # without another charge, all of V scales together
-            depletion = impurity_scale * self.unit_depletion_V
-            return depletion if depletion <= HIGHEST_BIAS_V else math.inf
-        return depletion_voltage(
-            self.potentials.bias,
-            self.total_V(0.0, impurity_scale, impurity_tilt),
-            self.grid.region,
-        )
-
-
-def solve(detector: Detector) -> Superposition:
+def solve(detector: Detector) -> Potentials:
     """Solve for the parts of a detector's potential, or load them.
 
     They are stored on disk (in ``$CPUNET_CACHE`` or the user's cache folder) and loaded if the
@@ -185,25 +86,20 @@ def solve(detector: Detector) -> Superposition:
 
 
 @functools.lru_cache(_MAX_SHAPES)
-def solved(unit: Detector, file: Path) -> Superposition:
+def solved(unit: Detector, file: Path) -> Potentials:
     """Parts of the potential of a detector with unit impurities, see `solve`."""
     with suppress(CpunetError, LookupError):  # if damaged, solved again and overwritten
-        arrays = read_arrays(file)
-        stored: dict[str, Any] = {k: v if v.ndim else v.item() for k, v in arrays.items()}
-        grid = Grid(**{field.name: stored[field.name] for field in fields(Grid)})
-        parts = {field.name: stored[field.name] for field in fields(Potentials)}
-        return Superposition(grid, Potentials(**parts), stored["depletion_V"])
+        arrays: dict[str, Any] = read_arrays(file)
+        stored = {field.name: arrays[field.name] for field in fields(Potentials)}
+        return Potentials(**{k: v if v.ndim else v.item() for k, v in stored.items()})
     with stage(f"Fields of {unit.name or 'the detector'}"):
         grid = make_grid(unit)
         log.debug(f"potentials on {len(grid.r_mm)} x {len(grid.z_mm)} nodes")
         potentials = solve_potentials(unit, grid)
-        fixed = potentials.impurities + potentials.surface
-        depletion = depletion_voltage(potentials.bias, fixed, grid.region)
     # atomically; a cache that cannot be written is ignored
     with suppress(CpunetError), written_aside(file) as aside:
-        content = vars(grid) | vars(potentials) | {"depletion_V": depletion}
-        np.savez(aside, allow_pickle=False, **content)
-    return Superposition(grid, potentials, depletion)
+        np.savez(aside, allow_pickle=False, **vars(potentials))
+    return potentials
 
 
 _V_PER_CM = 10.0  # of 1 V / mm
@@ -246,12 +142,11 @@ def compute_fields(detector: Detector) -> FieldMaps:
     CpunetError
         If the detector is not fully depleted, or the grid is too fine.
     """
-    solution = solve(detector)
-    grid, parts, bias = solution.grid, solution.potentials, detector.bias_V
+    parts, bias = solve(detector), detector.bias_V
     impurities = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
-    potential = solution.total_V(bias, *impurities)
-    depletion = functools.partial(solution.depletion_V, *impurities)
-    if has_pocket(potential, grid.region):
+    potential = parts.total_V(bias, *impurities)
+    depletion = functools.partial(parts.depletion_V, *impurities)
+    if has_pocket(potential, parts.region):
         if depletion() == math.inf:
             raise CpunetError(
                 f"detector {detector.name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
@@ -263,16 +158,16 @@ def compute_fields(detector: Detector) -> FieldMaps:
         )
     # without a charge or a plane below it, the field has no component normal to the face z = 0
     mirror = not (detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
-    e_r, e_z = electric_field(potential, grid, mirror=mirror)
+    e_r, e_z = electric_field(potential, parts, mirror=mirror)
     return FieldMaps(
-        r_mm=grid.r_mm,
-        z_mm=grid.z_mm,
-        grid_mm=grid.step_mm,
+        r_mm=parts.r_mm,
+        z_mm=parts.z_mm,
+        grid_mm=parts.step_mm,
         potential_V=potential,
         e_r_V_per_cm=e_r,
         e_z_V_per_cm=e_z,
         weighting_potential=parts.point_contact,
-        region=grid.region,
+        region=parts.region,
         capacitance_pF=parts.capacitance_pF,
         depletion=depletion,
     )
@@ -295,11 +190,11 @@ def scaled_to_depletion(detector: Detector) -> Detector:
             f"detector {detector.name}: no measured_depletion_V to scale its impurities by; "
             "add it to the file, or give `settings` measured_depletion_V=VALUE"
         )
-    solution, tilt = solve(detector), detector.impurity_tilt_1e10_per_cm4
+    parts, tilt = solve(detector), detector.impurity_tilt_1e10_per_cm4
     low, high = 1 / _LARGEST_SCALE, _LARGEST_SCALE
     while high / low > 1 + _SCALE_RESOLUTION:
         middle = math.sqrt(low * high)
-        pocket = has_pocket(solution.total_V(measured, middle, tilt), solution.grid.region)
+        pocket = has_pocket(parts.total_V(measured, middle, tilt), parts.region)
         low, high = (low, middle) if pocket else (middle, high)
     if low == 1 / _LARGEST_SCALE or high == _LARGEST_SCALE:
         raise CpunetError(

@@ -1,17 +1,30 @@
-"""Detectors from files: YAML of this package, siggen configurations, LEGEND metadata."""
+r"""Detectors from files: YAML of this package, siggen configurations, LEGEND metadata.
+
+LEGEND has diodes, and the crystals they were cut from. The ``impurity_curve`` of a crystal
+describes the boule from which detectors were cut. As LegendDataManagement.jl reads it for
+SolidStateDetectors.jl (its boule impurity densities), it gives the net acceptors in 1e9/cm3 as
+a function of the distance :math:`z` from the seed end of the boule in mm,
+
+.. math:: N(z) = a + b z + c z^2 + n\, e^{(z - l)/m}.
+
+With ``corrections`` this becomes ``scale`` times the curve plus ``offset`` (1e9/cm3). The
+``detector_offset_in_mm`` of a slice is the position of its point contact. From there the axis
+of the detector runs back to the seed end.
+"""
 
 from __future__ import annotations
 
 import logging
 import math
 import re
+import reprlib
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from cpunet.errors import CpunetError
-from cpunet.settings import Set, checked, key_values, names, read_text, read_values
+from cpunet.settings import Set, checked, flat, key_values, names, read_text, read_values
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.legend_metadata import detector_values
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +37,7 @@ _SIGGEN_BYTES = 1 << 16
 _SIGGEN_PARTS = (("xtal_", "crystal_"), ("pc_", "point_contact_"), ("hole_", "bore_"))
 _SIGGEN_NAMES = {
     "taper_angle": "taper_angle_deg",
+    "taper_length": "bottom_taper_length",
     "Li_thickness": "li_thickness",
     "impurity_z0": "impurity_z0_1e10_per_cm3",
     "impurity_gradient": "impurity_gradient_1e10_per_cm4",
@@ -35,10 +49,10 @@ _SIGGEN_NAMES = {
     "xtal_temp": "temperature_K",
     "xtal_grid": "grid_mm",
 }
-# alternative or neutral values, evaluated below
-_DERIVED = ("hole_length_gap", "outer_taper_width", "inner_taper_width", "bulletize_PC")
-# of siggen's version in three dimensions
-_OFFSETS = ("pc_offset_", "hole_offset_")
+# alternative or neutral values, and offsets of siggen's version in three dimensions
+_DERIVED = re.compile(
+    "bore_length_gap|(outer|inner)_taper_width|bulletize_PC|(point_contact|bore)_offset_.*"
+)
 _LEAST_POWER = 0.1
 # settings of the drift, and names of the program's files
 _NOT_OF_THE_DETECTOR = re.compile(
@@ -46,6 +60,64 @@ _NOT_OF_THE_DETECTOR = re.compile(
     "use_diffusion|energy|verbosity(_level)?|max_iterations|write_(field|WP)|"
     "surface_drift_vel_factor"
 )
+
+
+# keys of a diode and the fields of the detector
+_GEOMETRY = {
+    "height_in_mm": "crystal_length",
+    "radius_in_mm": "crystal_radius",
+    "pp_contact.radius_in_mm": "point_contact_radius",
+    "pp_contact.depth_in_mm": "point_contact_length",
+    "groove.depth_in_mm": "ditch_depth",
+    "groove.radius_in_mm.outer": "wrap_around_radius",
+    "groove.radius_in_mm.inner": "",
+    "borehole.radius_in_mm": "bore_radius",
+    "borehole.depth_in_mm": "bore_length",
+    "taper.top.height_in_mm": "outer_taper_length",
+    "taper.top.angle_in_deg": "taper_angle_deg",
+    "taper.borehole.height_in_mm": "inner_taper_length",
+    "taper.borehole.angle_in_deg": "inner_taper_angle_deg",
+    "taper.bottom.height_in_mm": "bottom_taper_length",
+    "taper.bottom.angle_in_deg": "bottom_taper_angle_deg",
+    "bulletization.top_radius_in_mm": "top_bullet_radius",
+    "bulletization.bottom_radius_in_mm": "bottom_bullet_radius",
+    "bulletization.borehole_radius_in_mm": "bore_bullet_radius",
+    "extra.topgroove.radius_in_mm": "top_groove_radius",
+    "extra.topgroove.depth_in_mm": "top_groove_depth",
+    "extra.top_cylinder.radius_in_mm": "top_cylinder_radius",
+    "extra.top_cylinder.height_in_mm": "top_cylinder_length",
+    "extra.bottom_cylinder.radius_in_mm": "bottom_cylinder_radius",
+    "extra.bottom_cylinder.height_in_mm": "bottom_cylinder_length",
+    "extra.bottom_cylinder.transition_in_mm": "bottom_transition_length",
+    "bulletization.pp-contact_radius_in_mm": "",
+    "bulletization.contact_radius_in_mm": "",
+}
+# fields of the detector and their locations; the first value above 0 is used
+_MEASURED = {
+    "bias_V": (
+        "characterization.l200_site.recommended_voltage_in_V",
+        "characterization.manufacturer.recommended_voltage_in_V",
+    ),
+    "measured_depletion_V": (
+        "characterization.l200_site.depletion_voltage_in_V",
+        "characterization.manufacturer.depletion_voltage_in_V",
+    ),
+    "li_thickness": (
+        "characterization.combined_0vbb_analysis.fccd_in_mm.value",
+        "characterization.manufacturer.dl_thickness_in_mm",
+    ),
+}
+_SIMULATED = ("icpc", "bege", "ppc")
+# parameters of each model of the impurity curve
+MODELS = {
+    "constant_boule": ("value",),
+    "linear_boule": ("a", "b"),
+    "parabolic_boule": ("a", "b", "c"),
+    "linear_exponential_boule": ("a", "b", "n", "l", "m"),
+    "parabolic_exponential_boule": ("a", "b", "c", "n", "l", "m"),
+}
+_ANOTHER = "correct it, or take another file of the crystal"
+_LARGEST_EXPONENT = 300
 
 
 def detector_names() -> list[str]:
@@ -142,69 +214,234 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
         words = line.split("#")[0].split()
         if not words or line[0] in " \t" or _NOT_OF_THE_DETECTOR.fullmatch(words[0]):
             continue
-        where, key = f"detector {name}: line {number}: {words[0]}", words[0]
-        key = {"taper_length": "bottom_taper_length"}.get(key, key).replace("_diam", "_radius")
-        if not (_field_of(key) or key in _DERIVED or key.startswith(_OFFSETS)):
+        where = f"detector {name}: line {number}: {words[0]}"
+        key = _SIGGEN_NAMES.get(words[0], words[0]).replace("_diam", "_radius")
+        for theirs, ours in _SIGGEN_PARTS:
+            key = key.replace(theirs, ours)
+        if key not in Detector.model_fields and not _DERIVED.fullmatch(key):
             raise CpunetError(f"{where}: unknown key; neither siggen nor fieldgen has it")
         try:
             values[key] = float(words[1]) / (2 if words[0].endswith("_diam") else 1)
         except (IndexError, ValueError) as error:
             raise CpunetError(f"{where} has no number; give one") from error
-        if key.startswith(_OFFSETS) and values.pop(key):
+        if "_offset_" in key and values[key]:
             raise CpunetError(
                 f"{where} is not 0; only axially symmetric detectors are simulated"
             )
-        if key == "hole_length_gap":
-            values["hole_length"] = values.get("xtal_length", math.nan) - values[key]
+        if key == "bore_length_gap":
+            values["bore_length"] = values.get("crystal_length", math.nan) - values[key]
     if values.get("bulletize_PC"):
         raise CpunetError(
             f"detector {name}: rounded point contacts are not simulated; set bulletize_PC to 0"
         )
     _fit(values, name)
-    fields = {field: value for key, value in values.items() if (field := _field_of(key))}
-    for side, angle in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
-        width, length = (values.get(f"{side}_taper_{x}", 0.0) for x in ("width", "length"))
-        own_angle = math.degrees(math.atan(width / length)) if length else math.nan
-        if length and not math.isclose(own_angle, values.get("taper_angle") or math.nan):
-            fields[angle] = own_angle
-    # siggen keeps the radius and the rounding of a hole that does not exist
-    if not fields.get("bore_length"):
-        fields = {k: v for k, v in fields.items() if not k.startswith("bore_")}
-    # without a power, fieldgen has no radial terms
-    if not values.get("impurity_rpower", 0.0) > _LEAST_POWER:
-        fields = {k: v for k, v in fields.items() if not k.startswith("impurity_radial")}
-    return fields
-
-
-def _field_of(key: str) -> str:
-    """Field of `Detector` of a key of siggen, ``""`` if there is none."""
-    field = _SIGGEN_NAMES.get(key, key)
-    for theirs, ours in _SIGGEN_PARTS:
-        field = field.replace(theirs, ours)
-    return field if field in Detector.model_fields else ""
+    # siggen keeps the radius and the rounding of a hole that does not exist; without a power,
+    # fieldgen has no radial terms
+    has_terms = values.get("impurity_radial_power", 0.0) > _LEAST_POWER
+    given = {"bore_": values.get("bore_length", 0.0) != 0, "impurity_radial": has_terms}
+    absent = tuple(prefix for prefix, is_given in given.items() if not is_given)
+    fields = Detector.model_fields
+    return {k: v for k, v in values.items() if k in fields and not k.startswith(absent)}
 
 
 def _fit(values: dict[str, float], name: str) -> None:
-    """Widen tapers to their angle, if any, and cut sizes that exceed others, as siggen does."""
-    if angle := values.get("taper_angle"):
-        for side in ("outer", "inner"):
+    """Widen tapers to their angle, if any, and cut sizes that exceed others, as siggen does.
+
+    A taper that is cut keeps its width.
+    """
+    angle = values.get("taper_angle_deg", 0.0)
+    widths = {side: values.get(f"{side}_taper_width", 0.0) for side in ("outer", "inner")}
+    if angle:
+        for side in widths:
             length = values.get(f"{side}_taper_length", 0.0)
-            values[f"{side}_taper_width"] = length * math.tan(math.radians(angle))
+            widths[side] = length * math.tan(math.radians(angle))
     around, ditch = values.get("wrap_around_radius", 0.0), values.get("ditch_thickness", 0.0)
-    straight = values.get("hole_length", math.inf) - values.get("hole_bullet_radius", 0.0)
-    most = {  # a taper that is cut keeps its width
+    straight = values.get("bore_length", math.inf) - values.get("bore_bullet_radius", 0.0)
+    most = {
         "inner_taper_length": ("hole_length - hole_bullet_radius", max(straight, 0.0)),
-        "hole_bullet_radius": ("hole_radius", values.get("hole_radius", math.inf)),
+        "bore_bullet_radius": ("hole_radius", values.get("bore_radius", math.inf)),
     }
     if around and ditch and values.get("ditch_depth"):
-        inside = around - ditch
-        most["pc_radius"] = ("wrap_around_radius - ditch_thickness", inside)
-        if values.get("pc_radius") == 0:
-            values["pc_radius"] = inside
+        most["point_contact_radius"] = ("wrap_around_radius - ditch_thickness", around - ditch)
+        if values.get("point_contact_radius") == 0:
+            values["point_contact_radius"] = around - ditch
     for key, (limit, size) in most.items():
         if values.get(key, 0.0) > size:
-            log.info(f"detector {name}: {key} is {size:g} mm, as in siggen: at most {limit}")
             values[key] = size
-    flat = values.get("xtal_radius", math.inf) - values.get("bottom_taper_length", 0.0)
-    if around >= flat and not values.get("ditch_depth"):
+            for theirs, ours in _SIGGEN_PARTS:
+                key = key.replace(ours, theirs)
+            log.info(f"detector {name}: {key} is {size:g} mm, as in siggen: at most {limit}")
+    for side, field in (("outer", "taper_angle_deg"), ("inner", "inner_taper_angle_deg")):
+        if length := values.get(f"{side}_taper_length", 0.0):
+            own_angle = math.degrees(math.atan(widths[side] / length))
+            if not math.isclose(own_angle, angle or math.nan):
+                values[field] = own_angle
+    flat_radius = values.get("crystal_radius", math.inf) - values.get(
+        "bottom_taper_length", 0.0
+    )
+    if around >= flat_radius and not values.get("ditch_depth"):
         values["wrap_around_radius"] = 0.0  # no wrap-around: lithium ends at the wall
+
+
+def detector_values(
+    diode: Mapping[str, Any], name: str
+) -> tuple[dict[str, Any], dict[str, str]]:
+    """Fields of `Detector` from a LEGEND diode, and reasons why it may not give one, by field.
+
+    Bias, measured depletion voltage and lithium thickness (the full charge collection depth,
+    FCCD) come from ``characterization``, where 0 means unknown. Impurities are those of the
+    crystal in a file nearby, see `impurity_values`.
+
+    Raises
+    ------
+    CpunetError
+        If the geometry has an unknown key (for example, one without its unit), lacks one, or
+        has a crack, which is not symmetric.
+    """
+    source, kind = f"detector {name}", diode.get("type")
+    if kind is not None and kind not in _SIMULATED:  # semi-coaxial ones collect on their bore
+        raise CpunetError(
+            f"{source}: type {reprlib.repr(kind)} is not simulated; "
+            f"give one of type {', '.join(_SIMULATED)}"
+        )
+    geometry = dict(flat(diode["geometry"]))
+    cracked = any(key.startswith("extra.crack.") for key in geometry)
+    if cracked and geometry.get("extra.crack.width_in_mm") != 0:
+        raise CpunetError(
+            f"{source}: geometry.extra.crack cuts off a side; only axially symmetric "
+            "crystals are simulated; remove it to simulate the crystal without it"
+        )
+    values: dict[str, Any] = {"name": str(diode.get("name", Path(name).stem))}
+    reasons = {field: f"no geometry.{key}" for key, field in _GEOMETRY.items()}
+    for key, value in geometry.items():
+        if key == "extra" or key.startswith("extra.crack"):
+            continue
+        if key not in _GEOMETRY:
+            raise CpunetError(
+                f"{source}: unknown key geometry.{key} (units belong to the key); "
+                "correct or remove it"
+            )
+        values[_GEOMETRY[key]] = value
+    values.pop("", None)
+    outer, inner = (
+        _number_at(diode, f"geometry.groove.radius_in_mm.{side}", source, 0.0)
+        for side in ("outer", "inner")
+    )
+    if geometry.get("groove.depth_in_mm"):
+        values["ditch_thickness"] = outer - inner
+    for field, places in _MEASURED.items():
+        reasons[field] = f"neither {' nor '.join(places)} is above 0"
+        numbers = [_number_at(diode, place, source, 0.0) for place in places]
+        if min(numbers) < 0:
+            raise CpunetError(
+                f"{source}: {places[numbers.index(min(numbers))]} is below 0",
+                "correct it, or write 0 for none",
+            )
+        if any(numbers):
+            values[field] = next(filter(None, numbers))
+    boule, cut = values["name"][:-1], values["name"][-1:]  # V99000 and A of V99000A
+    slice_name = str((diode.get("production") or {}).get("slice") or cut)
+    folder = Path(name).parent
+    folders = folder.parent / "crystals", folder / "crystals", folder
+    files = [place / f"{boule}{end}" for place in folders for end in _MAPPINGS]
+    crystal = next(filter(Path.is_file, files), None)
+    content: dict[str, Any] = read_values(crystal) if crystal else {}
+    length = values.get("crystal_length")
+    if content.get("impurity_curve") is None:
+        reasons["impurity_z0_1e10_per_cm3"] = (
+            f"{crystal} has no impurity_curve" if crystal else f"there is no {files[0]}"
+        )
+    elif isinstance(length, int | float):  # else refused with the rest of the geometry
+        values |= impurity_values(content, str(crystal), slice_name, length)
+    return values, reasons
+
+
+def impurity_values(
+    crystal: Mapping[str, Any], source: str, slice_name: str, length_mm: float
+) -> dict[str, float]:
+    """Impurity fields of `Detector` for one slice of a crystal.
+
+    Parameters
+    ----------
+    crystal
+        Content of the file of the crystal.
+    source
+        Name of the file for error messages.
+    slice_name
+        Slice from which the detector was cut, one of ``slices``, such as ``"A"``.
+    length_mm
+        Length of the detector along the axis in mm.
+
+    Raises
+    ------
+    CpunetError
+        If the curve, a parameter or the slice is missing or unknown.
+
+    Examples
+    --------
+    A constant 10 x 1e9/cm3 net acceptors are -1e10/cm3.
+
+    >>> crystal = {
+    ...     "impurity_curve": {"model": "constant_boule", "parameters": {"value": 10.0}},
+    ...     "slices": {"A": {"detector_offset_in_mm": 5.0}},
+    ... }
+    >>> impurity_values(crystal, "V99000.yaml", "A", 90.0)["impurity_z0_1e10_per_cm3"]
+    -1.0
+    """
+    curve = crystal.get("impurity_curve")
+    if not isinstance(curve, Mapping):
+        raise CpunetError(f"{source}: no impurity_curve; {_ANOTHER}")
+    model = curve.get("model")
+    if not isinstance(model, str) or model not in MODELS:
+        raise CpunetError(
+            f"{source}: impurity_curve.model {model!r} is unknown; models are "
+            f"{', '.join(MODELS)}; {_ANOTHER}"
+        )
+    numbers = dict.fromkeys("abcn", 0.0) | {
+        "a" if key == "value" else key: _number_at(
+            crystal, f"impurity_curve.parameters.{key}", source
+        )
+        for key in MODELS[model]
+    }
+    a, b, c, n = (numbers[key] for key in "abcn")
+    place = f"slices.{slice_name}.detector_offset_in_mm"
+    contact = _number_at(crystal, place, source)
+    scale = _number_at(crystal, "impurity_curve.corrections.scale", source, 1.0)
+    offset = _number_at(crystal, "impurity_curve.corrections.offset", source, 0.0)
+    # z of the boule is that of the contact minus the detector's z; 1e9 acceptors are -0.1 of
+    # our unit, and the scale does not apply to the offset
+    unit = -0.1 * scale
+    values = {
+        "impurity_z0_1e10_per_cm3": unit * (a + b * contact + c * contact**2) - 0.1 * offset,
+        # z^2 = L z - (L / 2)^2 (1 - (2 z / L - 1)^2), z in mm here and in cm there
+        "impurity_gradient_1e10_per_cm4": 10 * unit * (c * length_mm - b - 2 * c * contact),
+        "impurity_quadratic_1e10_per_cm3": -unit * c * length_mm**2 / 4,
+    }
+    if n:
+        begin, decay = numbers["l"], numbers["m"]
+        exponents = [(z - begin) / decay for z in (contact, contact - length_mm) if decay]
+        if not exponents or max(exponents) > _LARGEST_EXPONENT:
+            raise CpunetError(
+                f"{source}: impurity_curve.parameters.m = {decay:g} gives no finite "
+                f"exp((z - l) / m); {_ANOTHER}"
+            )
+        if amplitude := unit * n * math.exp(exponents[0]):  # 0 if it underflows
+            values["impurity_exponential_1e10_per_cm3"] = amplitude
+            values["impurity_exponential_length_mm"] = decay
+    return values
+
+
+def _number_at(
+    values: Mapping[str, Any], place: str, source: str, default: float | None = None
+) -> float:
+    """Number at a location such as ``"slices.A.detector_offset_in_mm"``."""
+    value: Any = values
+    for key in place.split("."):
+        if not isinstance(value, Mapping | None):
+            raise CpunetError(f"{source}: {place}: {value!r} stands before {key}; {_ANOTHER}")
+        value = value.get(key) if value else None
+    if (value := default if value is None else value) is None:
+        raise CpunetError(f"{source}: no {place}; {_ANOTHER}")
+    if type(value) not in (int, float) or not math.isfinite(value):
+        raise CpunetError(f"{source}: {place} = {value!r} is no number; {_ANOTHER}")
+    return float(value)

@@ -1,25 +1,56 @@
-"""Hits of a detector from files of all formats, and what is in such a file."""
+"""Hits of a detector from files: remage, Geant4 and g4simple, archives, and our own."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
-from contextlib import suppress
+import re
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
+import h5py
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
+from cpunet.hdf5_files import item_at, members, opened, units_of
 from cpunet.pulses.peaks import label_peaks
+from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.pulses.reading.columns import (
+    Texts,
+    divides,
+    dividing,
+    labels,
+    texts,
+    whole_numbers,
+)
 from cpunet.recipes.schema import PeakConfig
-from cpunet.simulation.hit_tables import StepTable, hit_format, step_tables
 from cpunet.simulation.hits import FloatArray, HitOptions, Hits, IntArray
 from cpunet.tables import Lines, counted, span
+from cpunet.units import factor, unit_names
 
 log = logging.getLogger(__name__)
 
+HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit
+_NTUPLES, _STEPS = "default_ntuples", "stp"
+_G4SIMPLE, _G4SIMPLE_TITLE, _G4SIMPLE_UNITS = "g4sntuple", "steps data", "mm,MeV"
+_CSV_MAGIC = b"#class tools::wcsv::ntuple"
+# what a column is, and its names in small letters: the first of these is read
+_NAMES = {
+    "event": ("evtid", "event", "event#", "eventid", "event_id", "event_number"),
+    "x": ("xloc", "x"),
+    "y": ("yloc", "y"),
+    "z": ("zloc", "z"),
+    "edep": ("edep", "energydeposit"),
+    "time": ("time", "t", "globaltime", "t0"),
+}
+_NEEDED = ("event", "x", "y", "z", "edep")
+_WITH_UNIT = re.compile(r"(.+?)\s*(?:\[(.*)\]|_in_(.+))$")
+# arrays of an NPZ, and the columns that they are
+_ARRAYS = {f"{axis}_mm": f"{axis}_in_mm" for axis in "xyz"} | {"edep_keV": "edep_in_keV"}
 # Larger than any laboratory and any event.
 FARTHEST_MM, MAX_KEV = 1e7, 1e9
 # Deposits of an event number that come later are another event, as in remage.
@@ -75,76 +106,193 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
             )
         if chosen is not None and chosen not in detectors:
             raise CpunetError(f"{file}: no detector {chosen}; it holds {names}")
-        return _hits_of(detectors[chosen or next(iter(detectors))], options)
+        return detectors[chosen or next(iter(detectors))].hits(options)
 
 
-def holds_hits(path: Path | str) -> bool:
-    """Whether a file contains hits rather than pulses.
+@dataclass(frozen=True, eq=False)
+class StepTable:
+    """Steps of a detector: columns by name, arrays or items of an open HDF5 file.
 
-    Files of simulated pulses that also contain their hits count as files of pulses.
+    Those of HDF5 are arrays with a value per row, or vectors with a value per step of the row;
+    the vectors of deposits give the steps of each row. The `name` is that of the detector,
+    empty without any. `units` are those of columns that name none: MeV and mm in tables of
+    g4simple. A `file` of remage tells where its detectors are. Where detectors share the table,
+    `labels` are those of the steps, and those with the name are read.
     """
-    with suppress(CpunetError):  # the reader of pulses reports the error
-        return hit_format(Path(path)) in ("tables", "csv", "npz")
-    return False
+
+    path: Path
+    columns: Mapping[str, Any]
+    name: str = ""
+    units: str = ""
+    file: h5py.File | None = None
+    labels: Texts | None = None
+
+    def by_detector(self) -> dict[str, StepTable]:
+        """The table, or its parts by the labels of their detectors where several share it.
+
+        Labels without deposits are the world or a holder.
+        """
+        of = roles(self.columns)
+        if missing := [role for role in _NEEDED if role not in of]:
+            raise CpunetError(
+                f"{self.path}: no column for {missing[0]}; "
+                f"the file holds {', '.join(self.columns)}"
+            )
+        deposits = self._read(of["edep"][0])[0] > 0
+        dividers = {name: self._read(name)[0] for name in self.columns if divides(name)}
+        some = {name: values[deposits] for name, values in dividers.items()}
+        names = dividing(some, int(deposits.sum())) or list(dividers)[:1]
+        if not names:
+            return {self.name: self}
+        of_steps = texts(dividers[names[0]]) if len(names) == 1 else labels(dividers, names)
+        detectors = sorted(map(str, np.unique(of_steps[deposits])), key=lambda x: (len(x), x))
+        if len(detectors) <= bool(self.name):
+            return {self.name: self}
+        return {label: replace(self, name=label, labels=of_steps) for label in detectors}
+
+    def hits(self, options: HitOptions) -> Hits:
+        """Group steps with a deposit by event (see `first_of_event`), in the order of the file.
+
+        Positions are moved to the frame of the crystal. An event whose number an earlier one
+        has gets a new one, above the largest. Late deposits of an event draw a warning.
+
+        Raises
+        ------
+        CpunetError
+            If a column is no number or names no unit that is understood; if a step has no
+            finite position, time or energy, or a negative energy; if a hit is far away, none
+            is left, or energies are of another unit.
+        """
+        chosen = slice(None) if self.labels is None else self.labels == self.name
+        others = *re.split(r"[\s,]+", options.units), *self.units.split(",")
+        steps: dict[str, npt.NDArray[Any]] = {}
+        for role, (name, in_name) in roles(self.columns).items():
+            values, unit = self._read(name)
+            where = f"{self.path}: column {name}"
+            if values.ndim != 1 or values.dtype.kind not in "iuf":
+                raise CpunetError(
+                    f"{where} is of {values.dtype} and shape {values.shape}; give one number "
+                    "per step (g4simple: its option for steps)"
+                )
+            if role == "event":
+                steps[role] = whole_numbers(values, where)[chosen]
+                continue
+            steps[role] = (values * _unit_factor(role, where, unit or in_name, others))[chosen]
+            origin = f"detector_origins/{self.name}/{role}loc"
+            if self.file is not None and origin in self.file:
+                # it may lack a unit; all lengths of remage are in m
+                item, where = self.file[origin], f"{self.path}: column {origin}"
+                to_mm = _unit_factor(role, where, units_of(item), ("m",))
+                steps[role] = steps[role] - item[()].item() * to_mm
+        event, edep = steps["event"], steps["edep"]
+        time = steps.get("time", np.zeros(len(event)))
+        # from the frame of the file to that of the crystal
+        mirror = np.array([1.0, -1.0, -1.0]) if options.flip_z else np.ones(3)
+        position = np.stack([steps[axis] for axis in "xyz"], axis=1)
+        position = (position - np.asarray(options.origin)) * mirror
+        # written so that NaN fails
+        placed = (np.abs(position) <= FARTHEST_MM).all(axis=1) & np.isfinite(time)
+        bad = ~(placed & (edep >= 0) & (edep <= MAX_KEV))
+        if bad.any():
+            raise CpunetError(
+                f"{self.path}: event {event[np.argmax(bad)]}: a step has no finite position or "
+                f"time, or no energy of at least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km "
+                f"away or have {MAX_KEV / 1e9:g} TeV); check the units and the origin, or "
+                "remove the event"
+            )
+        positive = np.flatnonzero(edep > 0)
+        if not len(positive):
+            raise CpunetError(
+                f"{self.path}: no step deposits energy; check the detector's name"
+            )
+        first = first_of_event(event[positive], time[positive])
+        # steps of one event need not be adjacent, as in files merged from several threads
+        order = positive[np.argsort(first, kind="stable")]
+        starts, counts = np.unique(first, return_counts=True)
+        numbers = event[positive][starts]
+        again = np.ones(len(numbers), bool)
+        again[np.unique(numbers, return_index=True)[1]] = False
+        numbers[again] = event.max() + 1 + np.arange(again.sum())
+        offsets = np.concatenate([[0], np.cumsum(counts)])
+        hits, times = Hits.of(position[order], edep[order], offsets, numbers), time[order]
+        spread = np.maximum.reduceat(times, offsets[:-1])
+        spread = spread - np.minimum.reduceat(times, offsets[:-1])
+        if late := int((spread > LATE_NS).sum()):
+            log.warning(
+                f"{self.path}: {late} events have deposits more than {LATE_NS:g} ns after "
+                "their first, simulated as if at once; if these are other events, give them "
+                "numbers of their own"
+            )
+        most = hits.energy_kev.max()
+        if most < _LEAST_KEV or np.median(hits.energy_kev) > _MOST_KEV:
+            raise CpunetError(
+                f"{self.path}: the energies of events, up to {most:.4g} keV, are no deposits "
+                "in germanium; correct the unit of their column (is it in MeV or eV?), or "
+                "give `units` if it names none"
+            )
+        return hits
+
+    def _read(self, name: str) -> tuple[npt.NDArray[Any], str]:
+        """Values of a column for all steps, and the unit that belongs to them."""
+        item, edep = self.columns[name], self.columns[roles(self.columns)["edep"][0]]
+        where, parts = f"{self.path}: column", {"cumulative_length", "flattened_data"}
+        vectors = isinstance(item, h5py.Group) and parts <= item.keys()
+        if not vectors and getattr(item, "ndim", 0) != 1:
+            raise CpunetError(f"{where} {name} is no array with a value per step or hit")
+        # each row ends with one of the steps
+        ends, of_edep = (
+            column["cumulative_length"][()].astype(np.int64)
+            if isinstance(column, h5py.Group)
+            else np.arange(len(column)) + 1
+            for column in (item, edep)
+        )
+        if len(ends) != len(of_edep) or (vectors and not np.array_equal(ends, of_edep)):
+            raise CpunetError(f"{where}s {name} and edep differ in length; truncated?")
+        if vectors:
+            flat = item["flattened_data"]
+            return np.asarray(flat[: ends.max(initial=0)]), units_of(flat) or units_of(item)
+        unit = units_of(item) if isinstance(item, h5py.Dataset) else ""
+        return np.repeat(item[()], np.diff(of_edep, prepend=0)), unit
 
 
-def _hits_of(table: StepTable, options: HitOptions) -> Hits:
-    """Group steps with a deposit by event (see `first_of_event`), in the order of the file.
+def roles(names: Iterable[str]) -> dict[str, tuple[str, str]]:
+    """What the columns of these `names` are: role → (name, unit in the name or ``""``).
 
-    Positions are moved to the frame of the crystal. An event whose number an earlier one has
-    gets a new one, above the largest. Late deposits of an event draw a warning.
+    Examples
+    --------
+    >>> roles(["evtid", "edep_in_keV", "X [mm]"])
+    {'event': ('evtid', ''), 'x': ('X [mm]', 'mm'), 'edep': ('edep_in_keV', 'keV')}
+    """
+    plain: dict[str, tuple[str, str]] = {}
+    for name in names:
+        match = _WITH_UNIT.match(name)
+        base, unit = (match[1], (match[2] or match[3] or "").strip()) if match else (name, "")
+        plain.setdefault(base.lower(), (name, unit))
+    return {
+        role: plain[next(filter(plain.__contains__, spellings))]
+        for role, spellings in _NAMES.items()
+        if not plain.keys().isdisjoint(spellings)
+    }
+
+
+def _unit_factor(role: str, where: str, unit: str, others: Iterable[str]) -> float:
+    """Conversion factor of a column in a `unit` to keV, ns or mm.
+
+    `role` is ``"edep"``, ``"time"`` or an axis. A column that names no unit is in the first of
+    the others that is of its kind. Times without a unit are in ns, Geant4's own.
 
     Raises
     ------
     CpunetError
-        If a step has no finite position, time or energy, or a negative energy; if a hit is far
-        away, none is left, or energies are of another unit.
+        If the unit is not understood, or nobody tells it.
     """
-    path, steps = table.path, table.steps(options.units)
-    event, edep = steps["event"], steps["edep"]
-    time = steps.get("time", np.zeros(len(event)))
-    # from the frame of the file to that of the crystal
-    mirror = np.array([1.0, -1.0, -1.0]) if options.flip_z else np.ones(3)
-    position = np.stack([steps[axis] for axis in "xyz"], axis=1)
-    position = (position - np.asarray(options.origin)) * mirror
-    # written so that NaN fails
-    placed = (np.abs(position) <= FARTHEST_MM).all(axis=1) & np.isfinite(time)
-    bad = ~(placed & (edep >= 0) & (edep <= MAX_KEV))
-    if bad.any():
-        raise CpunetError(
-            f"{path}: event {event[np.argmax(bad)]}: a step has no finite position or time, or "
-            f"no energy of at least 0 (nor may it lie {FARTHEST_MM / 1e6:g} km away or have "
-            f"{MAX_KEV / 1e9:g} TeV); check the units and the origin, or remove the event"
-        )
-    positive, largest = edep > 0, event.max(initial=-1)
-    if not positive.any():
-        raise CpunetError(f"{path}: no step deposits energy; check the detector's name")
-    position, edep = position[positive], edep[positive]
-    event, time = event[positive], time[positive]
-    first = first_of_event(event, time)
-    # steps of one event need not be adjacent, as in files merged from several threads
-    order = np.argsort(first, kind="stable")
-    starts, counts = np.unique(first, return_counts=True)
-    numbers = event[starts]
-    again = np.ones(len(numbers), bool)
-    again[np.unique(numbers, return_index=True)[1]] = False
-    numbers[again] = largest + 1 + np.arange(again.sum())
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    hits = Hits.of(position[order], edep[order], offsets, numbers)
-    times, begins, energy_kev = time[order], offsets[:-1], hits.energy_kev
-    spread = np.maximum.reduceat(times, begins) - np.minimum.reduceat(times, begins)
-    if late := int((spread > LATE_NS).sum()):
-        log.warning(
-            f"{path}: {late} events have deposits more than {LATE_NS:g} ns after their first, "
-            "simulated as if at once; if these are other events, give them numbers of their own"
-        )
-    if energy_kev.max() < _LEAST_KEV or np.median(energy_kev) > _MOST_KEV:
-        raise CpunetError(
-            f"{path}: the energies of events, up to {energy_kev.max():.4g} keV, are no "
-            "deposits in germanium; correct the unit of their column (is it in MeV or eV?), or "
-            "give `units` if it names none"
-        )
-    return hits
+    to = {"edep": "keV", "time": "ns"}.get(role, "mm")
+    unit = unit or next((other for other in (*others, "ns") if factor(other, to)), "")
+    if not unit:
+        raise CpunetError(f"{where} names no unit; give `units`, one of {unit_names(to)}")
+    if (to_ours := factor(unit, to)) is None:
+        raise CpunetError(f"{where} is in {unit!r}; expected one of {unit_names(to)}")
+    return to_ours
 
 
 def first_of_event(number: IntArray, time_ns: FloatArray) -> IntArray:
@@ -185,6 +333,113 @@ def first_of_event(number: IntArray, time_ns: FloatArray) -> IntArray:
     return first
 
 
+def hit_format(path: Path) -> Literal["tables", "stored", "csv", "npz", ""]:
+    """Format of a file of hits by its content; `stored` are hits with their pulses."""
+    if h5py.is_hdf5(path):
+        with opened(path) as file:
+            if any(isinstance(file.get(folder), h5py.Group) for folder in (_STEPS, _NTUPLES)):
+                return "tables"
+            return "stored" if HIT_TABLE in file else ""
+    if zipfile.is_zipfile(path):
+        with suppress(zipfile.BadZipFile), zipfile.ZipFile(path) as archive:
+            return "npz" if {"x_mm.npy", "offsets.npy"} <= {*archive.namelist()} else ""
+    try:
+        with path.open("rb") as stream:
+            return "csv" if stream.read(len(_CSV_MAGIC)) == _CSV_MAGIC else ""
+    except OSError as error:
+        raise CpunetError(f"{path}: cannot be read ({error.strerror})") from error
+
+
+def holds_hits(path: Path | str) -> bool:
+    """Whether a file contains hits rather than pulses.
+
+    Files of simulated pulses that also contain their hits count as files of pulses.
+    """
+    with suppress(CpunetError):  # the reader of pulses reports the error
+        return hit_format(Path(path)) in ("tables", "csv", "npz")
+    return False
+
+
+@contextmanager
+def step_tables(path: Path) -> Iterator[dict[str, StepTable]]:
+    """Open a file of hits; its tables, by detector, can be read until it is closed.
+
+    Raises
+    ------
+    CpunetError
+        If the file cannot be read, is of no known format or has no table of steps.
+    """
+    kind = hit_format(path)
+    if kind in ("csv", "npz"):
+        yield (_csv_table if kind == "csv" else _npz_table)(path).by_detector()
+        return
+    if not kind:
+        raise CpunetError(
+            f"{path}: no format of hits; expected LH5 or HDF5 with {_STEPS} (remage), "
+            f"{_NTUPLES} (Geant4, g4simple) or {HIT_TABLE} (cpunet simulate), CSV or NPZ"
+        )
+    with opened(path) as file:
+        groups = {"": file[HIT_TABLE]} if kind == "stored" else {}
+        for folder in (_STEPS, _NTUPLES):
+            if kind == "tables" and (held := item_at(file, folder)) is not None:
+                groups |= members(held)
+        tables: dict[str, StepTable] = {}
+        for name, group in groups.items():
+            if isinstance(group, h5py.Group) and {*_NEEDED} <= roles(group).keys():
+                # the values of a column of Geant4's HDF5 are its pages
+                columns = {
+                    key: item.get("pages", item) if isinstance(item, h5py.Group) else item
+                    for key, item in members(group).items()
+                }
+                # g4simple writes one table for all detectors
+                of = ("", _G4SIMPLE_UNITS) if name == _G4SIMPLE else (name, "")
+                tables |= StepTable(path, columns, *of, file).by_detector()
+        if not tables:
+            raise CpunetError(
+                f"{path}: no table of {_STEPS} or {_NTUPLES} has columns for "
+                f"{', '.join(_NEEDED)}; simulate again and write all steps"
+            )
+        yield tables
+
+
+def _npz_table(path: Path) -> StepTable:
+    """Arrays with a value per hit. Event i owns rows ``offsets[i]:offsets[i + 1]``."""
+    arrays = read_arrays(path)
+    needed = [*_ARRAYS, "offsets"]
+    if missing := [name for name in needed if name not in arrays]:
+        raise CpunetError(f"{path}: no array {missing[0]}; hits need {', '.join(needed)}")
+    counts = np.diff(whole_numbers(arrays["offsets"], f"{path}: offsets"))
+    if arrays["offsets"][:1].any() or np.any(counts < 0):
+        raise CpunetError(f"{path}: offsets do not divide the hits into events")
+    columns = {column: arrays[name] for name, column in _ARRAYS.items()}
+    return StepTable(path, columns | {"event": np.repeat(np.arange(len(counts)), counts)})
+
+
+def _csv_table(path: Path) -> StepTable:
+    """A CSV ntuple of Geant4, or several in one file; g4simple's is recognised by its title."""
+    from pandas import read_csv  # half a second, which other formats do not need
+
+    with path.open(encoding="utf-8", errors="replace") as lines:
+        headers = {n: line for n, line in enumerate(lines) if line.startswith("#")}
+    first = (line for i, (n, line) in enumerate(headers.items()) if i == n)
+    header = [line[1:].strip().partition(" ")[::2] for line in first]
+    names = [value.partition(" ")[2] for key, value in header if key == "column"]
+    about = {"title": "", "separator": str(ord(","))} | dict(header)
+    how: dict[str, Any] = {"sep": chr(int(about["separator"])), "encoding_errors": "replace"}
+    try:
+        # the columns of one file can be numbers, text or both
+        cells = read_csv(path, header=None, skiprows=[*headers], low_memory=False, **how)
+    except ValueError as error:
+        raise CpunetError(f"{path}: holds no steps ({error}); export again") from error
+    if (n := cells.shape[1]) != len(names):
+        raise CpunetError(f"{path}: {n} values a line for {len(names)} columns; export again")
+    if cells[n - 1].isna().any():
+        raise CpunetError(f"{path}: a line is not {n} values; is it cut off?")
+    columns = {name: cells[at].to_numpy() for at, name in enumerate(names)}
+    g4simple = about["title"] == _G4SIMPLE_TITLE
+    return StepTable(path, columns, units=_G4SIMPLE_UNITS if g4simple else "")
+
+
 def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
     """Columns of the table as name → (values, units), in the order of the events.
 
@@ -196,9 +451,7 @@ def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
     (['event_number', 'x', 'y', 'z', 'edep'], array([7, 7]))
     """
     number = hits.event_number[hits.event_of_hit]
-    places = {
-        axis: (values, "mm") for axis, values in zip("xyz", hits.position_mm.T, strict=True)
-    }
+    places = {axis: (hits.position_mm[:, i], "mm") for i, axis in enumerate("xyz")}
     return {"event_number": (number, ""), **places, "edep": (hits.edep_kev, "keV")}
 
 
@@ -225,22 +478,19 @@ def describe_hits(
     """
     detectors: dict[str, Lines] = {}
     with step_tables(path) as tables:
-        hits_of: dict[str, Hits] = {}
         for name, table in tables.items():
             try:
-                hits_of[name] = _hits_of(table, HitOptions(units=units))
+                hits = table.hits(HitOptions(units=units))
             except CpunetError as error:
                 detectors[name] = [("hits", str(error).removeprefix(f"{path}: "))]
-    for name, hits in hits_of.items():
-        lines = label_peaks(hits.energy_kev, peaks)
-        places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
-        extents = (
-            f"{axis} {span([values.min(), values.max()], 2)}" for axis, values in places.items()
-        )
-        detectors[name] = [
-            ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
-            ("energy", f"{span([hits.energy_kev.min(), hits.energy_kev.max()])} keV an event"),
-            ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
-            ("extents", f"{', '.join(extents)} mm"),
-        ]
+                continue
+            energy, lines = hits.energy_kev, label_peaks(hits.energy_kev, peaks)
+            places = {"x": hits.x_mm, "y": hits.y_mm, "z": hits.z_mm, "r": hits.r_mm}
+            extents = (f"{axis} {span([x.min(), x.max()], 2)}" for axis, x in places.items())
+            detectors[name] = [
+                ("hits", f"{len(hits.edep_kev)} of {len(hits)} events"),
+                ("energy", f"{span([energy.min(), energy.max()])} keV an event"),
+                ("lines", counted({peak: int((lines == peak).sum()) for peak in peaks})),
+                ("extents", f"{', '.join(extents)} mm"),
+            ]
     return detectors

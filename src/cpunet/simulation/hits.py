@@ -112,9 +112,7 @@ class Hits:
     @property
     def energy_kev(self) -> FloatArray:
         """Energy of each event in keV, the sum over its hits."""
-        return np.bincount(
-            self.event_of_hit, weights=self.edep_kev, minlength=len(self)
-        ).astype(np.float64)
+        return np.bincount(self.event_of_hit, self.edep_kev, len(self)).astype(np.float64)
 
     def __getitem__(self, which: slice | npt.NDArray[np.bool_] | IntArray) -> Hits:
         """Select events by a slice, a mask or a list of rows."""
@@ -123,19 +121,19 @@ class Hits:
         offsets = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
         # hit j of the result is hit j - offsets[i] of its original event
         take = np.arange(offsets[-1]) + np.repeat(self.offsets[rows] - offsets[:-1], counts)
-        chosen = self.position_mm[take], self.edep_kev[take]
-        return Hits.of(*chosen, offsets, self.event_number[rows])
+        place, edep = self.position_mm[take], self.edep_kev[take]
+        return Hits.of(place, edep, offsets, self.event_number[rows])
 
     @classmethod
     def concatenate(cls, sets: Sequence[Hits]) -> Hits:
         """Concatenate several sets, keeping the order of events."""
         counts = [np.diff(s.offsets) for s in sets]
-        return cls.of(
-            np.concatenate([s.position_mm for s in sets]),
-            np.concatenate([s.edep_kev for s in sets]),
-            np.concatenate([[0], np.cumsum(np.concatenate(counts))]),
-            np.concatenate([s.event_number for s in sets]),
+        place, edep, number = (
+            np.concatenate([getattr(s, name) for s in sets])
+            for name in ("position_mm", "edep_kev", "event_number")
         )
+        offsets = np.append(0, np.cumsum(np.concatenate(counts)))
+        return cls.of(place, edep, offsets, number)
 
 
 @dataclass(frozen=True, eq=False)

@@ -83,45 +83,47 @@ def _within(outline: Outline, r: float, z: float, shift: float, face: float) -> 
     `face` is the height of the passivated face.
     """
     wrapped = 0.0 < outline.wrap_around_radius < r
+    below_top = outline.crystal_length - z
     if not (shift if wrapped else face) < z < outline.crystal_length - shift:
         return False
-    if not r < _outer_wall(outline, z, shift) or _in_bore(outline, r, z, shift):
-        return False
-    top = z - outline.crystal_length + outline.top_bullet_radius
-    bottom = outline.bottom_bullet_radius - z
-    return not (
-        _beyond_bullet(outline, outline.top_bullet_radius, r, top, shift)
-        or _beyond_bullet(outline, outline.bottom_bullet_radius, r, bottom, shift)
-    )
-
-
-@kernel(error_model="numpy")
-def _beyond_bullet(
-    outline: Outline, bullet: float, r: float, along: float, shift: float
-) -> bool:
-    """Whether a point lies beyond the rounded edge of an end, `along` the axis into it."""
-    across = r - (outline.crystal_radius - bullet)
-    if bullet <= shift or across <= 0.0 or along <= 0.0:
-        return False
-    return math.sqrt(across * across + along * along) >= bullet - shift
-
-
-@kernel(error_model="numpy")
-def _outer_wall(outline: Outline, z: float, shift: float) -> float:
-    """Radius of the outer wall, moved in by `shift`, at a height."""
-    top, _, bottom = outline.taper_slopes
-    into_top = z - (outline.crystal_length - outline.outer_taper_length)
-    into_bottom = outline.bottom_taper_length - z
+    # the outer wall at this height
+    outer_slope, inner_slope, bottom_slope = outline.taper_slopes
     wall = outline.crystal_radius - shift
     beyond = outline.crystal_length - outline.top_cylinder_length - z
     wall -= _step(outline.steps[0], beyond, 0.0, shift)
     beyond = z - outline.bottom_cylinder_length
     wall -= _step(outline.steps[1], beyond, outline.bottom_transition_length, shift)
     if outline.outer_taper_length > 0.0:
-        wall -= _taper(outline, into_top, top, shift)
+        into = z - (outline.crystal_length - outline.outer_taper_length)
+        wall -= _taper(outline, into, outer_slope, shift)
     if outline.bottom_taper_length > 0.0:
-        wall -= _taper(outline, into_bottom, bottom, shift)
-    return wall
+        wall -= _taper(outline, outline.bottom_taper_length - z, bottom_slope, shift)
+    if not r < wall:
+        return False
+    # groove and bore, with their walls moved outwards
+    groove, radius = outline.top_groove_depth, outline.top_groove_radius
+    if groove > 0.0 and below_top <= groove + shift and r <= radius + shift:
+        return False
+    if outline.bore_length > 0.0 and below_top <= outline.bore_length + shift:
+        radius, bullet = outline.bore_radius + shift, outline.bore_bullet_radius
+        if outline.inner_taper_length > 0.0:
+            into = outline.inner_taper_length - below_top
+            radius += _taper(outline, into, inner_slope, shift)
+        across = r - (outline.bore_radius - bullet)
+        along = below_top - outline.bore_length + bullet
+        corner = across > 0.0 and along > 0.0
+        rounded = corner and math.sqrt(across * across + along * along) > bullet + shift
+        if r <= radius and not rounded:
+            return False
+    # rounded edges, `along` the axis into them
+    for at_top in (True, False):
+        bullet = outline.top_bullet_radius if at_top else outline.bottom_bullet_radius
+        along = z - outline.crystal_length + bullet if at_top else bullet - z
+        across = r - (outline.crystal_radius - bullet)
+        corner = bullet > shift and across > 0.0 and along > 0.0
+        if corner and math.sqrt(across * across + along * along) >= bullet - shift:
+            return False
+    return True
 
 
 @kernel(error_model="numpy")
@@ -142,24 +144,3 @@ def _taper(outline: Outline, into: float, slope: float, shift: float) -> float:
     else:  # the taper itself is moved along its normal
         extra = shift * (math.sqrt(1.0 + slope * slope) - 1.0)
     return max(into * slope + extra, 0.0)
-
-
-@kernel(error_model="numpy")
-def _in_bore(outline: Outline, r: float, z: float, shift: float) -> bool:
-    """Whether a point lies in bore or groove with their walls moved outwards by `shift`."""
-    below_top = outline.crystal_length - z
-    depth, radius = outline.top_groove_depth, outline.top_groove_radius
-    if depth > 0.0 and below_top <= depth + shift and r <= radius + shift:
-        return True
-    if outline.bore_length == 0.0 or below_top > outline.bore_length + shift:
-        return False
-    radius, bullet = outline.bore_radius + shift, outline.bore_bullet_radius
-    if outline.inner_taper_length > 0.0:
-        into = outline.inner_taper_length - below_top
-        radius += _taper(outline, into, outline.taper_slopes[1], shift)
-    if r > radius:
-        return False
-    across = r - (outline.bore_radius - bullet)
-    along = below_top - outline.bore_length + bullet
-    corner = across > 0.0 and along > 0.0
-    return not corner or math.sqrt(across * across + along * along) <= bullet + shift

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.constants import elementary_charge, epsilon_0
+from scipy.ndimage import label, minimum_filter
 from scipy.sparse.linalg import splu
 
 from cpunet.errors import CpunetError
@@ -31,6 +32,11 @@ MAX_NODES = 1_500_000
 # minimum distance to a contact, as a fraction of a step
 _NEAREST = 1e-4
 _BISECTIONS = 14
+# V: a pocket this shallow holds no charge (about kT/e at 90 K), and is not resolved by the
+# grid
+POCKET_DEPTH_V = 0.01
+HIGHEST_BIAS_V = 20_000.0
+_RESOLUTION_V = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,8 +123,8 @@ PF_PER_MM = epsilon_0 * 1e12 * 1e-3
 
 
 @dataclass(frozen=True, eq=False)
-class Potentials:
-    """Contributions of electrodes and charges to the potential; arrays (nr, nz).
+class Potentials(Grid):
+    """Contributions of electrodes and charges to the potential, at the nodes of a grid.
 
     Parameters
     ----------
@@ -127,8 +133,8 @@ class Potentials:
     bias
         Potential with 1 on the lithium and 0 on the point contact.
     impurities, tilt, surface
-        Potentials in V with all electrodes at 0: of the impurities, of a unit of their tilt,
-        and of the charge of the passivated surface.
+        Potentials in V with all electrodes at 0: of the impurities, neither scaled nor tilted,
+        of a unit of their tilt, and of the charge of the passivated surface.
     capacitance_pF
         Capacitance of the point contact in pF.
     """
@@ -139,6 +145,22 @@ class Potentials:
     tilt: FloatArray
     surface: FloatArray
     capacitance_pF: float
+
+    def total_V(self, bias_V: float, impurity_scale: float, impurity_tilt: float) -> FloatArray:
+        r"""Potential (nr, nz) in V for a bias in V and scaled and tilted impurities.
+
+        .. math:: V = b\, w + s\, u + t\, v + q
+
+        The tilt is in 1e10/cm4. Where the detector is not depleted, this is not the true
+        potential.
+        """
+        total = bias_V * self.bias + impurity_scale * self.impurities + self.surface
+        return total + impurity_tilt * self.tilt if impurity_tilt else total
+
+    def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
+        """Smallest bias in V that depletes the detector; infinite if none up to 20 kV does."""
+        charges = self.total_V(0.0, impurity_scale, impurity_tilt)
+        return depletion_voltage(self.bias, charges, self.region)
 
 
 def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
@@ -195,8 +217,15 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     energy = (r_flux * np.diff(point_contact, axis=0) ** 2).sum()
     energy += (z_flux * np.diff(point_contact, axis=1) ** 2).sum()
     energy += (to_ground * point_contact[:, 0] ** 2).sum()
-    capacitance = float(2 * np.pi * PF_PER_MM * energy)
-    return Potentials(point_contact, bias, impurities, tilt, surface, capacitance)
+    return Potentials(
+        **vars(grid),
+        point_contact=point_contact,
+        bias=bias,
+        impurities=impurities,
+        tilt=tilt,
+        surface=surface,
+        capacitance_pF=float(2 * np.pi * PF_PER_MM * energy),
+    )
 
 
 def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -299,3 +328,61 @@ def _germanium_in_cells(detector: Detector, grid: Grid) -> FloatArray:
         for edges, low, high in ((grid.r_mm, inner, outer), (grid.z_mm, 0.0, depth))
     )
     return np.asarray(1 - in_r[:, np.newaxis] * in_z)
+
+
+def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionArray) -> float:
+    r"""Smallest bias in V at which the potential has no pocket; infinite if there is none.
+
+    Parameters
+    ----------
+    bias, impurities
+        Potentials of a unit bias, and of the impurities in V, shape (nr, nz).
+    region
+        Region of each node, as from `Detector.region`.
+
+    Examples
+    --------
+    A planar detector of thickness :math:`d` depletes at :math:`e N d^2 / 2 \varepsilon`.
+
+    >>> import numpy as np
+    >>> z = np.tile(np.linspace(0, 10, 401), (3, 1))  # mm
+    >>> impurities = -10 * z * (10 - z) / 2  # e N / epsilon = 10 V / mm2
+    >>> region = np.where(z == 0, 0, np.where(z == 10, 1, 2))
+    >>> bool(abs(depletion_voltage(z / 10, impurities, region) - 500) < 5)
+    True
+    """
+    low, high = 0.0, HIGHEST_BIAS_V
+    if has_pocket(high * bias + impurities, region):
+        return float("inf")
+    if not has_pocket(impurities, region):
+        return 0.0
+    while high - low > _RESOLUTION_V:
+        middle = (low + high) / 2
+        pocket = has_pocket(middle * bias + impurities, region)
+        low, high = (middle, high) if pocket else (low, middle)
+    return high
+
+
+def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
+    """Whether `potential` (nr, nz), in V, keeps holes from reaching an electrode.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> r, z = np.meshgrid(np.arange(9), np.arange(9), indexing="ij")
+    >>> region = np.where(z == 0, 0, 2)
+    >>> has_pocket(z * 10.0, region), has_pocket((z - 4.0) ** 2, region)
+    (False, True)
+    """
+    minima = (potential <= minimum_filter(potential, size=3, mode="nearest")) & (
+        region == GERMANIUM
+    )
+    where = np.argwhere(minima)
+    for row, column in where[np.argsort(potential[minima])]:  # a true pocket is deep
+        start = potential[row, column]
+        basins, _ = label(potential <= start + POCKET_DEPTH_V, np.ones((3, 3)))
+        basin = basins == basins[row, column]
+        # below that level it leads neither to a contact nor to a lower node
+        if (region[basin] >= GERMANIUM).all() and (potential[basin] >= start).all():
+            return True
+    return False

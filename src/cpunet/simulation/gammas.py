@@ -1,47 +1,197 @@
-"""Hits of the 2614.5 keV gamma line of Tl-208 in a germanium detector.
+"""Monte Carlo of the 2614.5 keV gamma line of Tl-208, for users without Geant4 hits.
 
 In the compiled event loop photons from the source are followed until absorbed or lost, and
 electrons and positrons slow down in tabulated steps. Energies are in MeV, directions are unit
-vectors. Compton: Klein and Nishina, sampled as in Nelson et al., SLAC-265 (1985), § 2.9.
-Annihilation in flight: Heitler's cross section.
+vectors.
+
+Sources: photons, NIST XCOM (a CSV file of this folder); Compton scattering, Klein and Nishina,
+sampled as in Nelson et al., SLAC-265 (1985), § 2.9; collision stopping power, Bethe
+formula with the density effect of Sternheimer, Berger and Seltzer, At. Data Nucl. Data Tables
+30 (1984) 261; scattering, screened Rutherford with Molière's angle, Z. Naturf. 2a (1947) 133;
+bremsstrahlung, Bethe and Heitler in the form of Koch and Motz, Rev. Mod. Phys. 31 (1959) 920,
+with the limit of complete screening; annihilation in flight, Heitler, The Quantum Theory of
+Radiation (1954), § 27.
 """
 
 from __future__ import annotations
 
+import functools
 import logging
 import math
 from collections.abc import Mapping
+from importlib import resources
 from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.optimize import brentq
 
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
-from cpunet.simulation.gammas.tables import (
-    ELECTRON_CUT,
-    ELECTRON_MASS,
-    K_BINDING,
-    LOG_RATIO,
-    LOG_TOP,
-    PHOTON_CUT,
-    Array,
-    ElectronTable,
-    PhotonTable,
-    electron_table,
-    photon_table,
-)
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.outline import Outline, in_germanium, outline_of
 
 log = logging.getLogger(__name__)
 
+Array = npt.NDArray[np.float64]
 Integers = npt.NDArray[np.int64]
 
 MAX_HITS, MAX_PHOTONS = 2000, 256
 """Maximum numbers of hits and of photons per event; Tl-208 gives about 200 hits."""
+TL208_KEV = 2614.511
+"""Energy of the gamma line of Tl-208 in keV."""
+ELECTRON_MASS = 0.510998950
+"""Electron mass in MeV."""
+K_BINDING = 0.0111031
+"""Binding energy of the K shell in MeV."""
+PHOTON_CUT = 0.010
+"""Photons below this energy (MeV) are absorbed locally: their path is < 0.1 mm."""
+ELECTRON_CUT = 0.030
+"""Electrons below this energy (MeV) stop locally: their range is < 0.01 mm."""
+
+_TOP = 2.7
+_LOSS_PER_STEP = 0.12
+LOG_TOP, LOG_RATIO = float(np.log(_TOP)), float(np.log(1 - _LOSS_PER_STEP))
+_PHOTON_NODES = 4096
+_BREMS_NODES = 64
+_DENSITY, _A, _Z = 5.323, 72.630, 32
+_RADIUS = 2.8179403e-13
+_ALPHA = 1 / 137.035999
+_ATOMS = 6.02214076e23 * _DENSITY / _A
+_EXCITATION = 350e-6
+_STERNHEIMER = {"c": 5.1411, "x0": 0.3376, "x1": 3.6096, "a": 0.07188, "m": 3.3306}
+
+
+class PhotonTable(NamedTuple):
+    """Attenuation and fractions of the processes, on a grid equidistant in ln(energy)."""
+
+    log_first: float
+    per_log: float
+    attenuation_per_mm: Array
+    photoelectric: Array
+    not_pair: Array
+
+
+class ElectronTable(NamedTuple):
+    """One row per step, each losing the same fraction of the energy; lengths in mm.
+
+    ``energy`` (MeV) is the energy before the step. ``scattering`` is the scale b of the
+    distribution exp(-(1 - cos)/b) of the deflection, ``scattering_cut`` the value of its
+    integral at cos = -1. ``brems`` and ``annihilation`` are the probabilities of a hard photon
+    and of annihilation in flight within a step. ``photon_share[row]`` holds quantiles of the
+    energy of the hard photon relative to that of the electron.
+    """
+
+    energy: Array
+    step: Array
+    scattering: Array
+    scattering_cut: Array
+    brems: Array
+    annihilation: Array
+    photon_share: Array
+
+
+@functools.cache
+def photon_table() -> PhotonTable:
+    """Photon cross sections of XCOM without coherent scattering, which deposits no energy."""
+    source = resources.files(__package__) / "gamma_cross_sections.csv"
+    with source.open() as lines:
+        data = np.loadtxt(lines, delimiter=",", comments=("#", "E_MeV"))
+    energy, incoherent, photoelectric = data[:, 0], data[:, 2], data[:, 3]
+    pair = data[:, 4] + data[:, 5]
+    log = np.linspace(np.log(energy[0]), np.log(energy[-1]), _PHOTON_NODES)
+    compton = np.exp(np.interp(log, np.log(energy), np.log(incoherent)))
+    photo = np.exp(np.interp(log, np.log(energy), np.log(photoelectric)))
+    # the logarithm diverges at threshold: (1 - threshold / energy)^3 removes the steepness
+    grid = np.exp(log)
+    above = energy > 1.03
+    smooth = pair[above] / (1 - 2 * ELECTRON_MASS / energy[above]) ** 3
+    rise = np.clip(1 - 2 * ELECTRON_MASS / grid, 0, None) ** 3
+    pairs = rise * np.interp(log, np.log(energy[above]), smooth)
+    total = compton + photo + pairs
+    return PhotonTable(
+        log_first=float(log[0]),
+        per_log=float(1 / (log[1] - log[0])),
+        attenuation_per_mm=total * _DENSITY / 10,
+        photoelectric=photo / total,
+        not_pair=(photo + compton) / total,
+    )
+
+
+@functools.cache
+def electron_table() -> ElectronTable:
+    """Steps of an electron from 2.7 MeV down to the cut."""
+    ratio = 1 - _LOSS_PER_STEP
+    rows = int(np.ceil(np.log(ELECTRON_CUT / 4 / _TOP) / np.log(ratio)))
+    energy = np.asarray(_TOP * ratio ** np.arange(rows), np.float64)
+    middle = energy * np.sqrt(ratio)
+    # to collisions, and to photons below the cut
+    most = np.minimum(middle, PHOTON_CUT)
+    soft = _radiation(middle[:, np.newaxis], (np.arange(32) + 0.5) / 32 * most[:, np.newaxis])
+    step = energy * _LOSS_PER_STEP / (_collision_loss(middle) + soft.mean(axis=1) * most)
+    # photons above the cut: number per mm, and quantiles of their energy fraction k/T
+    hard, quantiles = np.zeros(rows), np.ones((rows, _BREMS_NODES))
+    for i in np.flatnonzero(middle > PHOTON_CUT):
+        log = np.linspace(np.log(PHOTON_CUT), np.log(middle[i]), 256)
+        density = _radiation(middle[i], np.exp(log))
+        cumulative = np.append(0.0, np.cumsum((density[1:] + density[:-1]) / 2))
+        wanted = np.linspace(0, cumulative[-1], _BREMS_NODES)
+        quantiles[i] = np.exp(np.interp(wanted, cumulative, log)) / middle[i]
+        hard[i] = np.trapezoid(density, log)
+    # inverse of the first transport mean free path: -d<cos>/ds at s = 0
+    momentum = np.sqrt(middle * (middle + 2 * ELECTRON_MASS))
+    beta = momentum / (middle + ELECTRON_MASS)
+    angle = _ALPHA * ELECTRON_MASS / momentum * _Z ** (1 / 3) / 0.885
+    screening = angle**2 / 4 * (1.13 + 3.76 * (_ALPHA * _Z / beta) ** 2)
+    size = 2 * np.pi * _RADIUS**2 * _Z * (_Z + 1) * (ELECTRON_MASS / (momentum * beta)) ** 2
+    transport = _ATOMS / 10 * size * (np.log(1 + 1 / screening) - 1 / (1 + screening))
+    turned = 1 - np.exp(-step * transport)
+    # scale b for which exp(-x/b) on 0 < x < 2 has this mean (below 1)
+    scale = np.array(
+        [brentq(lambda b, m=m: b - 2 / np.expm1(2 / b) - m, 3e-3, 1e4) for m in turned]
+    )
+    # of positrons in flight, per mm
+    gamma = 1 + middle / ELECTRON_MASS
+    root = np.sqrt(gamma**2 - 1)
+    bracket = (gamma**2 + 4 * gamma + 1) / root**2 * np.log(gamma + root) - (gamma + 3) / root
+    annihilation = np.pi * _RADIUS**2 / (gamma + 1) * bracket * _ATOMS * _Z / 10
+    return ElectronTable(
+        energy=energy,
+        step=step,
+        scattering=scale,
+        scattering_cut=1 - np.exp(-2 / scale),
+        brems=1 - np.exp(-step * hard),
+        annihilation=1 - np.exp(-step * annihilation),
+        photon_share=quantiles,
+    )
+
+
+def _collision_loss(kinetic: Array) -> Array:
+    """Collision stopping power in MeV/mm."""
+    gamma = 1 + kinetic / ELECTRON_MASS
+    tau = gamma - 1
+    beta2 = 1 - gamma**-2
+    x = np.log10(np.sqrt(gamma**2 - 1))
+    s = _STERNHEIMER
+    bend = s["a"] * np.clip(s["x1"] - x, 0, None) ** s["m"]
+    density = np.where(x < s["x0"], 0.0, 2 * np.log(10) * x - s["c"] + bend)
+    form = 1 - beta2 + (tau**2 / 8 - (2 * tau + 1) * np.log(2)) / gamma**2
+    logarithm = np.log(tau**2 * (tau + 2) / (2 * (_EXCITATION / ELECTRON_MASS) ** 2))
+    scale = 2 * np.pi * _RADIUS**2 * ELECTRON_MASS * _ATOMS * _Z / 10
+    return np.asarray(scale / beta2 * (logarithm + form - density))
+
+
+def _radiation(kinetic: float | Array, photon: Array) -> Array:
+    """K dΣ/dk in 1/mm: photon energy times macroscopic cross section per photon energy."""
+    before = kinetic + ELECTRON_MASS
+    after = before - photon
+    ratio = after / before
+    unscreened = np.log(2 * before * after / (photon * ELECTRON_MASS)) - 0.5
+    logarithm = np.minimum(unscreened, np.log(183 * _Z ** (-1 / 3)))
+    scale = 4 * _ALPHA * _RADIUS**2 * _Z * (_Z + 1) * _ATOMS / 10
+    return np.asarray(scale * (1 + ratio**2 - 2 / 3 * ratio) * logarithm)
 
 
 class UnitVector(NamedTuple):
@@ -118,15 +268,6 @@ def compton_energy(energy: float, rng: np.random.Generator) -> float:
 
 
 @kernel(error_model="numpy")
-def pair_share(rng: np.random.Generator) -> float:
-    """Electron's fraction of a pair's kinetic energy: p+ p-, the phase space at threshold."""
-    while True:
-        share = rng.random()
-        if rng.random() < 2.0 * math.sqrt(share * (1.0 - share)):
-            return share
-
-
-@kernel(error_model="numpy")
 def annihilation_energy(kinetic: float, rng: np.random.Generator) -> tuple[float, float]:
     """Energy of one of the two photons, and the cosine of its angle to the positron."""
     gamma = 1.0 + kinetic / ELECTRON_MASS
@@ -184,15 +325,6 @@ def put_photon(
 
 
 @kernel(error_model="numpy")
-def row_of(table: ElectronTable, kinetic: float) -> int:
-    """Index of the step that contains an energy (MeV), from its upper end downwards."""
-    if kinetic <= ELECTRON_CUT:
-        return 0
-    row = int((math.log(kinetic) - LOG_TOP) / LOG_RATIO)
-    return min(max(row, 0), len(table.energy) - 2)
-
-
-@kernel(error_model="numpy")
 def slow_down(
     outline: Outline,
     table: ElectronTable,
@@ -210,9 +342,15 @@ def slow_down(
     displacement are therefore correct despite the long steps.
     """
     x, y, z = position
-    row = row_of(table, kinetic)
-    part = (kinetic - table.energy[row + 1]) / (table.energy[row] - table.energy[row + 1])
+    row, part, within_step = -1, 1.0, True
     while kinetic > ELECTRON_CUT:
+        row, part = row + 1, 1.0
+        if within_step:  # the step that holds this energy, from its upper end downwards
+            row = int((math.log(kinetic) - LOG_TOP) / LOG_RATIO)
+            row = min(max(row, 0), len(table.energy) - 2)
+            after = table.energy[row + 1]
+            part = (kinetic - after) / (table.energy[row] - after)
+        within_step = False
         length = part * table.step[row]
         hinge = length * rng.random()
         x, y, z = x + hinge * direction.x, y + hinge * direction.y, z + hinge * direction.z
@@ -223,32 +361,26 @@ def slow_down(
         scale = table.scattering[row] * part
         cosine = 1.0 + scale * math.log(1.0 - rng.random() * table.scattering_cut[row])
         direction = turned(direction, cosine, 2.0 * math.pi * rng.random())
-        rest = length - hinge
-        x, y, z = x + rest * direction.x, y + rest * direction.y, z + rest * direction.z
+        length -= hinge
+        x, y, z = x + length * direction.x, y + length * direction.y, z + length * direction.z
         if not in_germanium(outline, x, y, z, 0.0):
             return
         chance = rng.random()
         if chance < part * table.brems[row]:
             shares = table.photon_share[row]
             at = rng.random() * (len(shares) - 1)
-            node = int(at)
-            share = shares[node] + (at - node) * (shares[node + 1] - shares[node])
-            photon = min(share, 1.0) * kinetic
+            low, high = shares[int(at)], shares[int(at) + 1]
+            photon = min(low + (at - int(at)) * (high - low), 1.0) * kinetic
             put_photon(event, x, y, z, forward(direction, kinetic, rng), photon)
-            kinetic -= photon
-            row = row_of(table, kinetic)
-            above = table.energy[row + 1]
-            part = (kinetic - above) / (table.energy[row] - above)
-            continue
-        if positron and 1.0 - chance < part * table.annihilation[row]:
-            energy, cosine = annihilation_energy(kinetic, rng)
+            kinetic, within_step = kinetic - photon, True
+        elif positron and 1.0 - chance < part * table.annihilation[row]:
             momentum = math.sqrt(kinetic * (kinetic + 2.0 * ELECTRON_MASS))
+            energy, cosine = annihilation_energy(kinetic, rng)
             first = turned(direction, cosine, 2.0 * math.pi * rng.random())
             put_photon(event, x, y, z, first, energy)
             second = remainder(momentum, direction, energy, first)
             put_photon(event, x, y, z, second, kinetic + 2.0 * ELECTRON_MASS - energy)
             return
-        row, part = row + 1, 1.0
     record(event, x, y, z, kinetic)
     if positron:
         cosine, up = 2.0 * rng.random() - 1.0, UnitVector(0.0, 0.0, 1.0)
@@ -288,9 +420,8 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
                 break
             at = (math.log(energy) - photons.log_first) * photons.per_log
             node = int(at)
-            left = photons.attenuation_per_mm[node]
-            attenuation = left + (at - node) * (photons.attenuation_per_mm[node + 1] - left)
-            path = -math.log(1.0 - rng.random()) / attenuation
+            low, high = photons.attenuation_per_mm[node], photons.attenuation_per_mm[node + 1]
+            path = -math.log(1.0 - rng.random()) / (low + (at - node) * (high - low))
             x, y, z = x + path * direction.x, y + path * direction.y, z + path * direction.z
             if (
                 not 0.0 <= z <= outline.crystal_length
@@ -311,14 +442,16 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
                 cosine = 1.0 - ELECTRON_MASS * (1.0 / left_over - 1.0 / energy)
                 scattered = turned(direction, cosine, 2.0 * math.pi * rng.random())
                 recoil = remainder(energy, direction, left_over, scattered)
-                kinetic = energy - left_over
-                slow_down(outline, electrons, event, place, recoil, kinetic, electron, rng)
+                part = energy - left_over
+                slow_down(outline, electrons, event, place, recoil, part, electron, rng)
                 energy, direction = left_over, scattered
                 continue
-            kinetic = energy - 2.0 * ELECTRON_MASS
-            of_electron = pair_share(rng) * kinetic
+            # of a pair's kinetic energy: p+ p-, the phase space at threshold
+            kinetic, share = energy - 2.0 * ELECTRON_MASS, rng.random()
+            while rng.random() >= 2.0 * math.sqrt(share * (1.0 - share)):
+                share = rng.random()
             for positron in (False, True):
-                part = kinetic - of_electron if positron else of_electron
+                part = kinetic - share * kinetic if positron else share * kinetic
                 away = forward(direction, part, rng)
                 slow_down(outline, electrons, event, place, away, part, positron, rng)
             break
@@ -413,10 +546,6 @@ def simulate_events(
     return hits[:end], events[:n_events], n_primaries, n_left_out
 
 
-TL208_KEV = 2614.511
-"""Energy of the gamma line of Tl-208 in keV."""
-
-
 class EnergyWindow(NamedTuple):
     """Energies (keV) from `low_kev` to `high_kev`, both included, under a name."""
 
@@ -433,7 +562,6 @@ def simulate_gammas(
     n_primaries: int,
     seed: int,
     wanted: Mapping[EnergyWindow, int] = MappingProxyType({}),
-    energy_kev: float = TL208_KEV,
 ) -> tuple[Hits, int]:
     r"""Simulate gammas from a disc above the crystal, in vacuum.
 
@@ -461,8 +589,6 @@ def simulate_gammas(
     wanted
         Number of events requested in each energy window. Only events in a window count,
         until each has its number.
-    energy_kev
-        Energy of the gammas, 50 to 2700 keV.
 
     Returns
     -------
@@ -478,15 +604,15 @@ def simulate_gammas(
         requested events.
     """
     for line in wanted:
-        if not line.low_kev < line.high_kev or line.low_kev > energy_kev:
+        if not line.low_kev < line.high_kev or line.low_kev > TL208_KEV:
             raise CpunetError(
                 f"{line.name}: window {line.low_kev} to {line.high_kev} keV holds no event of "
-                f"the {energy_kev} keV line; give another"
+                f"the {TL208_KEV} keV line; give another"
             )
     medium = Medium(outline_of(detector), photon_table(), electron_table())
     height, radius = float(source_height_mm), float(source_radius_mm)
     cosine = height / math.hypot(height, detector.crystal_radius + radius)
-    source = energy_kev / 1e3, height, radius, cosine
+    source = TL208_KEV / 1e3, height, radius, cosine
     # the sum of deposits equals the energy of the line only up to rounding
     edges = [(line.low_kev / 1e3 - 1e-9, line.high_kev / 1e3 + 1e-9) for line in wanted]
     windows, missing = np.array(edges).reshape(-1, 2), np.array([*wanted.values()], np.int64)
