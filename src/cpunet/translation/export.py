@@ -56,11 +56,7 @@ class Export:
 
 
 def export_onnx(
-    run: RunLike,
-    out: str | Path,
-    *,
-    inverse: bool = False,
-    force: bool = False,
+    run: RunLike, out: str | Path, *, inverse: bool = False, force: bool = False
 ) -> Export:
     """Export the deterministic part of a run as ONNX, and check it against the run.
 

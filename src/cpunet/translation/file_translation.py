@@ -95,11 +95,7 @@ class FileTranslation:
     """
 
     def __init__(
-        self,
-        run: RunLike,
-        options: TranslateOptions,
-        resume: bool = False,
-        force: bool = False,
+        self, run: RunLike, options: TranslateOptions, resume: bool = False, force: bool = False
     ) -> None:
         self.run, self.options, self.force = as_run(run), options, force
         self.resume = resume and not force
