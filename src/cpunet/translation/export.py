@@ -145,6 +145,11 @@ def graph_of(
         Shape of a draw, empty without.
     expected
         What the run makes of inputs.
+
+    Raises
+    ------
+    CpunetError
+        If it has no graph, or ONNX lacks an operator.
     """
     behind = getattr(network, "linear", None) or getattr(network, "residual", None)
     if behind is not None:
@@ -162,36 +167,17 @@ def graph_of(
             )
         return chain_model(network.response, length), (), network
     needed("onnxscript")
-    latent = network.unet.latent_mean.out_channels, length // 16
-    model, expected = network_model(network.unet, examples(2, length, latent))
-    return model, latent, expected
-
-
-def network_model(
-    unet: Any, given: dict[str, FloatArray]
-) -> tuple[Any, Callable[..., FloatArray]]:
-    """The model of a U-Net for any batch size, and the U-Net as a function of arrays.
-
-    Parameters
-    ----------
-    unet
-        The U-Net.
-    given
-        Windows (batch, samples) and a draw (batch, channels, samples / 16), as an example.
-
-    Raises
-    ------
-    CpunetError
-        If ONNX lacks an operator.
-    """
     import torch
+
+    latent = network.unet.latent_mean.out_channels, length // 16
+    given = examples(2, length, latent)
 
     class WithDraw(torch.nn.Module):
         """The U-Net, whose latent draw is an input."""
 
         def __init__(self) -> None:
             super().__init__()
-            self.unet = unet
+            self.unet = network.unet
 
         def forward(self, windows: torch.Tensor, epsilon: torch.Tensor) -> torch.Tensor:
             return self.unet(windows[:, None], epsilon=epsilon)[:, 0]  # type: ignore[no-any-return]
@@ -221,7 +207,7 @@ def network_model(
             )
     except torch.onnx.OnnxExporterError as error:
         raise CpunetError("ONNX has no operators for this run's U-Net") from error
-    return program.model_proto, expected
+    return program.model_proto, latent, expected
 
 
 def examples(n: int, length: int, latent: tuple[int, ...]) -> dict[str, FloatArray]:
