@@ -18,10 +18,7 @@ from cpunet.simulation.simulator import cluster_hits
 N_EVENTS = 3_000
 DEP = {EnergyWindow("DEP", 1591.0, 1594.0): N_EVENTS}
 # fractions of the gammas in the cone to the crystal: any hit; within 1 keV of FEP, SEP and DEP
-GEANT4 = {
-    20.0: (0.4265, 0.0997, 0.01131, 0.00370),
-    100.0: (0.4450, 0.1101, 0.01199, 0.00386),
-}
+GEANT4 = {20.0: (0.4265, 0.0997, 0.01131, 0.00370), 100.0: (0.4450, 0.1101, 0.01199, 0.00386)}
 LINES_KEV = (2614.511, 2103.511, 1592.511)
 
 

@@ -1,18 +1,21 @@
-"""Rates of the pulse simulation on one core.
+"""Time for field maps, solved and read from the cache, and rates of pulses on one core.
 
 Run with ``python benchmarks/signals.py``; takes about half a minute.
 """
 
 from __future__ import annotations
 
+import os
+import tempfile
 import time
 
 import numba
 import numpy as np
 
+from cpunet.simulation.fields import compute_fields
 from cpunet.simulation.gammas import simulate_gammas
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.geometry_readers import read_detector
+from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulator import Simulator
@@ -33,7 +36,26 @@ def random_events(detector: Detector, n_hits: int, seed: int) -> Hits:
     return Hits.of(place, rng.uniform(50, 1000, n_hits), offsets)
 
 
+def fields() -> None:
+    """Field maps of the detectors of the package."""
+    for name in detector_names():
+        detector, seconds = read_detector(name), []
+        with tempfile.TemporaryDirectory() as folder:
+            os.environ["CPUNET_CACHE"] = folder
+            for _ in range(2):
+                start = time.perf_counter()
+                maps = compute_fields(detector)
+                seconds.append(time.perf_counter() - start)
+        shape = " x ".join(map(str, maps.potential_V.shape))
+        print(
+            f"{name}: {shape} nodes, solved {seconds[0]:.2f} s, cached {seconds[1]:.3f} s; "
+            f"{maps.capacitance_pF:.3f} pF, depleted at {maps.depletion_V:.0f} V"
+        )
+    del os.environ["CPUNET_CACHE"]
+
+
 def main() -> None:
+    fields()
     numba.set_num_threads(1)
     detector = read_detector("icpc")
     gammas, _ = simulate_gammas(

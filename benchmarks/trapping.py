@@ -66,11 +66,7 @@ def of_trapping(chain: StepResponse, detector: Detector, fields: FieldMaps) -> N
             a, lq = told(chain, waveforms / waveforms[:, -1:])
             lines = [
                 np.quantile(change, (0.5, 0.16, 0.84))
-                for change in (
-                    -100 * with_it.trapped,
-                    100 * (a / amplitude - 1),
-                    lq - charge,
-                )
+                for change in (-100 * with_it.trapped, 100 * (a / amplitude - 1), lq - charge)
             ]
             print(
                 f"{name.partition('_')[0]:9}{rate:g}/us  "

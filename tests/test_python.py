@@ -25,7 +25,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes import load_recipe
 from cpunet.tables import with_std
-from cpunet.translation.translator import NOISE_ROWS, RejectionWarning
+from cpunet.translation.translator import BATCH, RejectionWarning
 from synthetic import FACTS, KEV, write_run, write_sides
 
 SHORT = {
@@ -150,7 +150,7 @@ def test_a_run_of_a_network(tmp_path):
 def test_a_seed_gives_the_same_pulses_in_memory_in_a_file_and_of_arrays(home, run, tmp_path):
     """Of more pulses than have a common seed of the noise."""
     sim = Pulses.concatenate([cpunet.open_pulses(home / "sim.lh5").read()] * 4)
-    assert len(sim) == 4 * N > 2 * NOISE_ROWS
+    assert len(sim) == 4 * N > 2 * BATCH
     kept = run.translate(sim, seed=4)
     stored = cpunet.translate(run.folder, sim, tmp_path / "t.lh5", seed=4)
     assert np.array_equal(kept.waveforms, stored.waveforms, equal_nan=True)

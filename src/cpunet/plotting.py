@@ -51,7 +51,7 @@ LABELS = {
 STACKED: dict[str, Any] = {"sharex": True, "height_ratios": (3, 2)}
 
 # Inches around panels, from an axis to its label, and of a line of a legend.
-LEFT, RIGHT, BOTTOM, TOP, LABEL, LINE = 0.85, 0.15, 0.48, 0.3, 0.48, 0.18
+LEFT, RIGHT, BOTTOM, TOP, LABEL, LINE = 1.0, 0.15, 0.48, 0.3, 0.6, 0.18
 
 _STYLE = {
     "font.size": 10.0,

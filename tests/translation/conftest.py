@@ -13,19 +13,6 @@ from cpunet.recipes.schema import Recipe
 from games import untrained
 from synthetic import FACTS, SMALL_NETWORK, decaying_traces, edges, load_recipe, write_run
 
-DT_NS = 16.0
-
-
-def simulated(n: int, seed: int) -> npt.NDArray[np.float32]:
-    """Charge signals: edges of random width that end at 1."""
-    return np.asarray(edges(n, seed), np.float32)
-
-
-def measured(n: int, seed: int) -> npt.NDArray[np.float32]:
-    """The same through a decay, in ADC counts on a baseline, with noise."""
-    traces = decaying_traces(edges(n, seed), np.random.default_rng(seed), noise_adc=8)
-    return np.asarray(traces, np.float32)
-
 
 @pytest.fixture(scope="session")
 def recipe() -> Recipe:
@@ -43,9 +30,12 @@ def network(tmp_path_factory: pytest.TempPathFactory, recipe: Recipe) -> Path:
 
 @pytest.fixture
 def sim() -> npt.NDArray[np.float32]:
-    return simulated(5, seed=7)
+    """Charge signals: edges of random width that end at 1."""
+    return edges(5, seed=7).astype(np.float32)
 
 
 @pytest.fixture
 def data() -> npt.NDArray[np.float32]:
-    return measured(5, seed=8)
+    """The like through a decay, in ADC counts on a baseline, with noise."""
+    traces = decaying_traces(edges(5, seed=8), np.random.default_rng(8), noise_adc=8)
+    return np.asarray(traces, np.float32)

@@ -22,8 +22,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.translation import export
 from cpunet.translation.dspeed_processor import ren
-from cpunet.translation.export import export_onnx
-from cpunet.translation.onnx_readout import chain_model
+from cpunet.translation.export import chain_model, export_onnx
 from cpunet.translation.translator import IREN, REN
 from synthetic import load_recipe, waveform_table, write_chain
 

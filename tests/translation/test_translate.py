@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+from itertools import product
 
 import awkward as ak
 import h5py
@@ -25,13 +26,7 @@ from cpunet.translation.options import Adc
 from cpunet.translation.translate import translate
 from cpunet.translation.translation import Counts
 from cpunet.translation.translator import REN, noise_seed
-from synthetic import (
-    edges,
-    load_recipe,
-    nearly_full_disk,
-    write_chain,
-    write_table,
-)
+from synthetic import edges, load_recipe, nearly_full_disk, write_chain, write_table
 
 DT_NS, N = 16.0, 40
 NOISE_KEV = 2.0
@@ -184,11 +179,7 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
             file.copy("geds/sim", f"{channel}/sim")
         del file["geds"]
     outcome = translate(run, PulseFile(source, "all"), tmp_path / "out")
-    assert {name: made.counts.translated for name, made in outcome.done.items()} == {
-        "ch1": N,
-        "ch2": N,
-    }
-    assert outcome.ok
+    assert {n: of.counts.translated for n, of in outcome.done.items()} == {"ch1": N, "ch2": N}
     first, second = (values(tmp_path / "out" / f"ch{i}.lh5")[:, :300] for i in (1, 2))
     together = (first * second).mean() / (first.std() * second.std())
     assert together == pytest.approx(0, abs=0.05)
@@ -232,13 +223,8 @@ def test_all_that_pulses_can_be_gives_the_same(run, tmp_path):
 
 
 def test_seeds_differ_by_file_and_block():
-    seeds = [
-        noise_seed(seed, key, block)
-        for seed in (0, 1)
-        for key in (None, "a.lh5", "b.lh5")
-        for block in (0, 1)
-    ]
-    assert len(set(seeds)) == len(seeds)
+    each = product((0, 1), (None, "a.lh5", "b.lh5"), (0, 1))
+    assert len({noise_seed(*of_block) for of_block in each}) == 12
     assert noise_seed(5, None, 0) == 5
     assert noise_seed(5, "s\udcff.lh5", 0) != 5  # a name that is not UTF-8
 
@@ -262,12 +248,6 @@ def require_same(folder, expected):
         assert (folder / path.name).read_bytes() == path.read_bytes()
 
 
-def test_no_output_is_the_input_of_another(run, many, tmp_path):
-    (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
-    with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
-        translate(run, many, tmp_path, force=True)
-
-
 @pytest.mark.parametrize("jobs", [1, pytest.param(2, marks=pytest.mark.slow)])
 def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
     run, many, sequential, tmp_path, caplog, jobs
@@ -282,7 +262,9 @@ def test_processes_change_nothing_and_a_bad_file_does_not_keep_the_others(
     assert multiprocessing.active_children() == []
 
 
-def test_resume_skips_what_is_finished(run, many, sequential, tmp_path):
+def test_resume_skips_what_is_finished_and_refuses_what_was_made_otherwise(
+    run, network, many, sequential, tmp_path
+):
     out = tmp_path / "out"
     translate(run, many[:2], out)
     before = [(out / f"sim_{i}.lh5").stat().st_mtime_ns for i in (0, 1)]
@@ -292,11 +274,8 @@ def test_resume_skips_what_is_finished(run, many, sequential, tmp_path):
     assert (told.skipped, told.translated) == (2, 3 * N)
     assert [(out / f"sim_{i}.lh5").stat().st_mtime_ns for i in (0, 1)] == before
     require_same(out, sequential)
-
-
-def test_resume_refuses_what_was_made_otherwise(run, network, many, sequential, tmp_path):
     other = PulseFile(sim_file(tmp_path / "sim_0.lh5", seed=9))
-    foreign = tmp_path / "out"
+    foreign = tmp_path / "foreign"
     foreign.mkdir()
     (foreign / "sim_0.lh5").write_bytes(b"x")
     for of, sources, out, options, said in (
@@ -554,3 +533,6 @@ def test_names(run, many, sequential, tmp_path):
     shared = [PulseFile(one.path, energy="hit.lh5:a/b") for one in many]
     with pytest.raises(CpunetError, match="belongs to one file"):
         translate(run, shared, tmp_path / "out")
+    (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
+    with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
+        translate(run, many, tmp_path, force=True)

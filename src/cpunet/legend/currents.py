@@ -101,6 +101,8 @@ def most_frequent(amplitudes: Values) -> float:
     --------
     >>> round(most_frequent(np.array([1.0, 2.0, 2.0, 3.0])), 2)
     2.0
+    >>> most_frequent(np.full(3, 0.0081))
+    0.0081
     """
     if np.ptp(amplitudes) == 0:  # the bins would be 0.001/ns wide, a tenth of A/E
         return float(amplitudes[0])

@@ -13,11 +13,10 @@ from __future__ import annotations
 import copy
 import json
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Self
 
 import h5py
 import numpy as np
@@ -101,6 +100,12 @@ class TemplateTranslator:
         for rows in blocks(len(templates), BATCH):
             results[rows] = self._chain(templates[rows].astype(np.float32))[:, inside]
         return results
+
+    def delay_ns(self) -> float:
+        """Time of the largest averaged current after a step of charge, sampled at 1 ns."""
+        step = np.zeros((1, STEP_LENGTH), np.float32)
+        step[:, STEP_SAMPLE:] = 1
+        return float(currents_about_peak(self(step))[1][0]) - STEP_SAMPLE
 
 
 @dataclass(frozen=True)
@@ -205,16 +210,17 @@ def translate_library(
     """
     run, source, out = used_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
-    translate = TemplateTranslator(REN.of(run), PERIOD_NS)
-    numbers: dict[str, LibraryNumbers] = {}
+    translate, numbers = TemplateTranslator(REN.of(run), PERIOD_NS), dict[str, LibraryNumbers]()
     with opened(source) as given:
         names = chosen_libraries(given, source, detector, known_detector(run))
-        ideal = [IdealLibrary.of(given, name, source) for name in names]
+        axes = [library_axes(given, name, source) for name in names]
         made_from = {"run": run.name, "weights": run.weights_sha256, "ideal": str(source)}
         with written_hdf5(out) as (made, _):
-            for name, charge in zip(names, ideal, strict=True):
+            for name, (r_mm, z_mm) in zip(names, axes, strict=True):
                 group = made.require_group(name)
-                numbers[name] = _write(translate, charge, group)
+                numbers[name] = _write(
+                    translate, given[name], r_mm, z_mm, group, f"{source}: {name}"
+                )
                 content = {"cpunet": cpunet.__version__, "rings": RINGS, **made_from}
                 group.attrs["cpunet"] = json.dumps(content | asdict(numbers[name]))
                 describe(group)
@@ -269,131 +275,120 @@ def known_detector(run: Run) -> str | None:
     return run.sim.detector
 
 
-@dataclass(frozen=True, eq=False)
-class IdealLibrary:
-    """Templates of charge of a detector in a file, sampled every nanosecond.
+def library_axes(file: h5py.File, path: str, source: Path) -> tuple[Values, Values]:
+    """Grid points of a library in r and z, in mm.
 
-    Attributes
-    ----------
-    where
-        File and group, for messages.
-    group
-        The group.
-    r_mm, z_mm
-        Grid points.
-    angles
-        Azimuths such as ``"000_deg"``, ascending.
+    Raises
+    ------
+    CpunetError
+        If the library does not follow the schema, or its templates are not sampled every
+        nanosecond.
     """
-
-    where: str
-    group: h5py.Group
-    r_mm: Values
-    z_mm: Values
-    angles: tuple[str, ...]
-
-    @classmethod
-    def of(cls, file: h5py.File, path: str, source: Path) -> Self:
-        """Read the axes of a library.
-
-        Raises
-        ------
-        CpunetError
-            If the library does not follow the schema, or its templates are not sampled every
-            nanosecond.
-        """
-        where, group = f"{source}: {path or '/'}", file[path or "/"]
-        if not path:
-            raise CpunetError(
-                f"{source}: the library stands at the top of the file; production finds it "
-                "under the detector's name: write it into a group of this name"
-            )
-        if missing := sorted({"r", "z", "dt"} - set(group)):
-            raise CpunetError(
-                f"{where}: no {missing[0]} with the waveforms; complete the library"
-            )
-        r_mm, z_mm = (_axis(group[name], f"{where}: {name}") for name in ("r", "z"))
-        dt, units = group["dt"], units_of(group["dt"])
-        dt_ns = (factor(units, "ns") or np.nan) * dt[()].item() if is_column(dt) else np.nan
-        if not np.isclose(dt_ns, PERIOD_NS):
-            raise CpunetError(
-                f"{where}: sampled every {dt_ns:g} ns (dt in {str(units)!r}), production reads "
-                "templates of 1 ns; make the library with a period of 1 ns"
-            )
-        names = sorted(filter(WAVEFORM.fullmatch, group))
-        for name in names:
-            values = group[name]
-            numbers = isinstance(values, h5py.Dataset) and values.dtype.kind in "iuf"
-            shape: tuple[int, ...] = values.shape if numbers else ()
-            if len(shape) != 3 or shape[:2] != (len(r_mm), len(z_mm)) or shape[2] < 3:
-                raise CpunetError(
-                    f"{where}/{name}: shape {shape} with r and z of {len(r_mm)} and "
-                    f"{len(z_mm)}; expected numbers of shape (r, z, samples)"
-                )
-        angles = tuple(name.removeprefix("waveform_") for name in names)
-        return cls(where, group, r_mm, z_mm, angles)
-
-
-def _axis(column: h5py.Dataset, where: str) -> Values:
-    """Grid points in mm."""
-    units = units_of(column)
-    if (mm_per_unit := factor(units, "mm")) is None:
-        raise CpunetError(f"{where} is in {units!r}; expected one of {unit_names('mm')}")
-    numbers = is_column(column) and column.ndim == 1 and len(column) > 1
-    values = np.asarray(column[()] if numbers else [0, 0], np.float64) * mm_per_unit
-    if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
-        raise CpunetError(f"{where} does not ascend from node to node; write the library again")
-    if np.abs(values).max() > LARGEST_MM:
+    where, group, axes = f"{source}: {path or '/'}", file[path or "/"], list[Values]()
+    if not path:
         raise CpunetError(
-            f"{where} reaches {np.abs(values).max():g} mm, beyond any crystal; are its "
-            f"units ({units}) right?"
+            f"{source}: the library stands at the top of the file; production finds it "
+            "under the detector's name: write it into a group of this name"
         )
-    return values
+    if missing := sorted({"r", "z", "dt"} - set(group)):
+        raise CpunetError(f"{where}: no {missing[0]} with the waveforms; complete the library")
+    for name in ("r", "z"):
+        column, units = group[name], units_of(group[name])
+        if (mm_per_unit := factor(units, "mm")) is None:
+            expected = unit_names("mm")
+            raise CpunetError(f"{where}: {name} is in {units!r}; expected one of {expected}")
+        numbers = is_column(column) and column.ndim == 1 and len(column) > 1
+        values = np.asarray(column[()] if numbers else [0, 0], np.float64) * mm_per_unit
+        if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
+            raise CpunetError(
+                f"{where}: {name} does not ascend from node to node; write the library again"
+            )
+        if np.abs(values).max() > LARGEST_MM:
+            raise CpunetError(
+                f"{where}: {name} reaches {np.abs(values).max():g} mm, beyond any crystal; are "
+                f"its units ({units}) right?"
+            )
+        axes.append(values)
+    dt, units = group["dt"], units_of(group["dt"])
+    dt_ns = (factor(units, "ns") or np.nan) * dt[()].item() if is_column(dt) else np.nan
+    if not np.isclose(dt_ns, PERIOD_NS):
+        raise CpunetError(
+            f"{where}: sampled every {dt_ns:g} ns (dt in {str(units)!r}), production reads "
+            "templates of 1 ns; make the library with a period of 1 ns"
+        )
+    for name in filter(WAVEFORM.fullmatch, group):
+        values = group[name]
+        numbers = isinstance(values, h5py.Dataset) and values.dtype.kind in "iuf"
+        shape: tuple[int, ...] = values.shape if numbers else ()
+        if len(shape) != 3 or shape[:2] != (len(axes[0]), len(axes[1])) or shape[2] < 3:
+            raise CpunetError(
+                f"{where}/{name}: shape {shape} with r and z of {len(axes[0])} and "
+                f"{len(axes[1])}; expected numbers of shape (r, z, samples)"
+            )
+    return axes[0], axes[1]
 
 
 def _write(
-    translate: TemplateTranslator, library: IdealLibrary, group: h5py.Group
+    translate: TemplateTranslator,
+    library: h5py.Group,
+    r_mm: Values,
+    z_mm: Values,
+    group: h5py.Group,
+    where: str,
 ) -> LibraryNumbers:
-    """Write currents, and drift times within the crystal and about it."""
-    step = np.zeros((1, STEP_LENGTH), np.float32)
-    step[:, STEP_SAMPLE:] = 1
-    delay_ns = float(currents_about_peak(translate(step))[1][0]) - STEP_SAMPLE
-    r_mm = padded_axis(library.r_mm, 0, RINGS)  # none at negative radii
-    z_mm = padded_axis(library.z_mm, RINGS, RINGS)
-    shape, inner = (len(r_mm), len(z_mm)), np.s_[: len(library.r_mm), RINGS : len(z_mm) - RINGS]
+    """Write currents, and drift times within the crystal and about it.
+
+    Raises
+    ------
+    CpunetError
+        If an azimuth has no template, a row of r or of z has none although rows on both sides
+        of it have, or most are no pulses of charge.
+    """
+    delay_ns = translate.delay_ns()
+    shape = len(r_mm) + RINGS, len(z_mm) + 2 * RINGS  # none at negative radii
+    inner = np.s_[: len(r_mm), RINGS:-RINGS]
+    angles = sorted(filter(WAVEFORM.fullmatch, library))
     currents, times = dict[str, Floats](), dict[str, Values]()
-    templates = len(library.r_mm) * len(library.z_mm) * len(library.angles)
-    not_ending = 0
-    with stage(f"Translating {library.group.name.strip('/')}", templates) as bar:
-        for angle in library.angles:
+    inside = dict[str, npt.NDArray[np.bool_]]()
+    templates, not_ending = len(r_mm) * len(z_mm) * len(angles), 0
+    with stage(f"Translating {library.name.strip('/')}", templates) as bar:
+        for name in angles:
+            angle = name.removeprefix("waveform_")
             currents[angle] = np.full((*shape, LENGTH), np.nan, np.float32)
             times[angle] = np.full(shape, np.nan)
             within = currents[angle][inner], times[angle][inner]
-            for rows in blocks(len(library.r_mm), ROWS):
-                held, charge = _held(library, f"waveform_{angle}", rows)
+            for rows in blocks(len(r_mm), ROWS):
+                charge = np.array(library[name][rows], np.float32)
+                missing = np.isnan(charge)
+                part = np.argwhere(missing.any(axis=2) & ~missing.all(axis=2))
+                if len(part):
+                    r, z = r_mm[rows][part[0, 0]], z_mm[part[0, 1]]
+                    raise CpunetError(
+                        f"{where}: {len(part)} templates hold NaN among their samples, the "
+                        f"first at r {r:g}, z {z:g} mm of {name}; simulate the library again, "
+                        "with longer records if charge was late"
+                    )
+                held = charge.any(axis=2) & ~missing[:, :, 0]  # only zeros are no template
+                charge = charge[held]
                 within[0][rows][held], when = currents_about_peak(translate(charge))
                 within[1][rows][held] = when - delay_ns
                 late = charge[:, -1] < MIN_END * np.abs(charge).max(axis=1)
                 not_ending += int((np.isfinite(when) & late).sum())
                 bar.update(held.size)
-    inside = {angle: np.isfinite(when[inner]) for angle, when in times.items()}
+            inside[angle] = np.isfinite(within[1])
+            _require_complete(inside[angle], angle, r_mm, z_mm, where)
     translated = sum(int(mask.sum()) for mask in inside.values())
-    if not translated:
-        raise CpunetError(
-            f"{library.where}: none of {templates} templates can be translated; are they "
-            "charge pulses?"
-        )
     if 2 * not_ending > translated:
         raise CpunetError(
-            f"{library.where}: {not_ending} of {translated} templates end below half of their "
+            f"{where}: {not_ending} of {translated} templates end below half of their "
             "maximum: these are currents, of negative sign, or behind electronics already; "
             "give the library of charge pulses"
         )
-    _require_complete(inside, library)
     amplitudes = [currents[a][inner][mask, PEAK] for a, mask in inside.items()]
     mode = most_frequent(np.concatenate(amplitudes).astype(float))
 
-    put(group, "r", r_mm, "mm")
-    put(group, "z", z_mm, "mm")
+    put(group, "r", padded_axis(r_mm, 0, RINGS), "mm")
+    put(group, "z", padded_axis(z_mm, RINGS, RINGS), "mm")
     put(group, "dt", PERIOD_NS, "ns")
     put(group, "t0", -PEAK * PERIOD_NS, "ns")
     padded = healed = 0
@@ -408,55 +403,20 @@ def _write(
     return LibraryNumbers(templates, translated, padded, healed, mode, delay_ns)
 
 
-def _held(
-    library: IdealLibrary, name: str, rows: slice
-) -> tuple[npt.NDArray[np.bool_], Floats]:
-    """Which grid points of some rows hold a template, and these; only zeros are none.
-
-    Raises
-    ------
-    CpunetError
-        If only a part of a template is NaN.
-    """
-    charge = np.array(library.group[name][rows], np.float32)
-    missing = np.isnan(charge)
-    part = missing.any(axis=2) & ~missing.all(axis=2)
-    if part.any():
-        i, j = np.argwhere(part)[0]
-        raise CpunetError(
-            f"{library.where}: {int(part.sum())} templates hold NaN among their samples, the "
-            f"first at r {library.r_mm[rows][i]:g}, z {library.z_mm[j]:g} mm of {name}; "
-            "simulate the library again, with longer records if charge was late"
-        )
-    held = charge.any(axis=2) & ~missing[:, :, 0]
-    return held, charge[held]
-
-
 def _require_complete(
-    inside: Mapping[str, npt.NDArray[np.bool_]], library: IdealLibrary
+    mask: npt.NDArray[np.bool_], angle: str, r_mm: Values, z_mm: Values, where: str
 ) -> None:
-    """Raise an error if a library lacks whole rows of grid points between others.
-
-    Raises
-    ------
-    CpunetError
-        If an azimuth has no template, or a row of r or of z has none although rows on both
-        sides of it have.
-    """
-    for angle, mask in inside.items():
-        if not mask.any():
+    """Raise an error if an azimuth lacks whole rows of grid points between others, or all."""
+    if not mask.any():
+        raise CpunetError(
+            f"{where}: no template of {angle} can be translated; are they charge pulses? "
+            "Simulate this azimuth again, or leave it out"
+        )
+    for name, axis, rows in (("r", r_mm, mask.any(axis=1)), ("z", z_mm, mask.any(axis=0))):
+        held = np.flatnonzero(rows)
+        missing = np.setdiff1d(np.arange(held[0], held[-1]), held)
+        if len(missing):
             raise CpunetError(
-                f"{library.where}: no template of {angle} can be translated; simulate this "
-                "azimuth again, or leave it out"
+                f"{where}: {len(missing)} rows of {angle} are NaN between others, the first at "
+                f"{name} {axis[missing[0]]:g} mm; simulate these places again"
             )
-        for name, axis, rows in (
-            ("r", library.r_mm, mask.any(axis=1)),
-            ("z", library.z_mm, mask.any(axis=0)),
-        ):
-            held = np.flatnonzero(rows)
-            missing = np.setdiff1d(np.arange(held[0], held[-1]), held)
-            if len(missing):
-                raise CpunetError(
-                    f"{library.where}: {len(missing)} rows of {angle} are NaN between others, "
-                    f"the first at {name} {axis[missing[0]]:g} mm; simulate these places again"
-                )

@@ -26,11 +26,7 @@ LOW_KEV = 20.0  # below which energies that leave no pulse are likely in MeV
 
 
 def ren(
-    run: str,
-    period: Any = None,
-    noise: bool = True,
-    seed: int = 0,
-    device: str = "cpu",
+    run: str, period: Any = None, noise: bool = True, seed: int = 0, device: str = "cpu"
 ) -> GUFuncWrapper:
     """Make a processor of a trained run: simulated waveforms → measured-like windows.
 

@@ -30,6 +30,7 @@ log = logging.getLogger(__name__)
 
 OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
 
+Make = Callable[[RunLike], FileTranslation]
 Task = tuple[PulseFile, Path, str]  # a file, its output, and the name of its noise
 
 
@@ -115,8 +116,8 @@ def translate(
         )
     if jobs < 1:
         raise CpunetError(f"`jobs` is {jobs}; expected 1 or more")
-    digitiser = scale if adc else None
-    options = TranslateOptions(inverse, noise, seed, out_table, digitiser, tails, pile_up_khz)
+    digits = scale if adc else None
+    options = TranslateOptions(inverse, noise, seed, out_table, digits, tails, pile_up_khz)
     files = list(_files(pulses, read, insist, run))
     several = len(files) > 1 or str(out).endswith("/") or (out and Path(out).is_dir())
     channels = any(file.table == ALL for file in files)
@@ -157,9 +158,6 @@ def _files(
             if not names:
                 raise CpunetError(f"{pattern}: no such files; check the name")
         yield from (pulse_file(name, read, insist) for name in names)
-
-
-Make = Callable[[RunLike], FileTranslation]
 
 
 def _channels(make: Make, runs: RunLike, source: PulseFile, out: Path) -> Outcome[Translation]:

@@ -17,21 +17,19 @@ from typing import Any, ClassVar, Self, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.drawn_pile_up import Columns, DrawnTails, InTracePileUp
+from cpunet.electronics.drawn_pile_up import Columns, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.preparation import Codes, Kind, Rejection, prepare, rejections_of
-from cpunet.recipes.schema import Recipe
 from cpunet.tables import counted
 from cpunet.training.run import Run
-from cpunet.translation.backends import Backend, Batch, Energies, Translated, backend_of
+from cpunet.translation.backends import Batch, Energies, Translated, backend_of
 
 Waveforms = TypeVar("Waveforms", npt.NDArray[np.floating], Pulses)
 
-NO_ENERGY = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
-NO_HEIGHT = "the electronics of this run act by the height of a pulse; give energy_kev"
-BATCH = 512  # pulses per batch: bounds memory, with little effect on the speed
-NOISE_ROWS = 512  # pulses read at a time, which have a common seed of the noise
+# Pulses translated at a time, which have a common seed of the noise: bounds memory, with little
+# effect on the speed
+BATCH = 512
 
 
 class RejectionWarning(UserWarning):
@@ -104,15 +102,13 @@ class Translator:
 
     part: ClassVar[str]
     takes: ClassVar[Kind]
-    sign: ClassVar[int]
 
-    def __init__(
-        self, backend: Backend, recipe: Recipe, dt_ns: float, delay_ns: float = 0.0
-    ) -> None:
-        self.backend, self.recipe, self.dt_ns = backend, recipe.at(dt_ns), dt_ns
-        self.delay_ns = delay_ns
-        self.needs_energies = backend.noise is not None
-        self.tails: DrawnTails | None = backend.tails
+    def __init__(self, run: Run, device: str = "cpu") -> None:
+        self.backend = backend_of(run, self.part, device)
+        self.recipe, self.dt_ns, self.tails = run.recipe, run.dt_ns, self.backend.tails
+        self.needs_energies = self.backend.noise is not None
+        sign = 1 if self.takes == "simulated" else -1
+        self.delay_ns = 0.0 if run.fit is None else sign * run.fit.delay_ns
 
     @classmethod
     def of(cls, run: Run, device: str = "cpu") -> Self:
@@ -123,8 +119,7 @@ class Translator:
         CpunetError
             If the weights of the run do not match its recipe.
         """
-        delay_ns = 0.0 if run.fit is None else cls.sign * run.fit.delay_ns
-        return cls(backend_of(run, cls.part, device), run.recipe, run.dt_ns, delay_ns)
+        return cls(run, device)
 
     @classmethod
     def load(cls, run: str | Path, device: str = "cpu") -> Self:
@@ -135,7 +130,7 @@ class Translator:
         CpunetError
             If the folder is not a finished run, or its weights do not match its recipe.
         """
-        return cls.of(Run.load(run), device)
+        return cls(Run.load(run), device)
 
     def translate(
         self,
@@ -183,12 +178,12 @@ class Translator:
             pulses, ndim = waveforms, 2
             energy_kev = pulses.energy_kev if energy_kev is None else energy_kev
         else:
-            array = np.asarray(waveforms)
-            ndim, pulses = array.ndim, Pulses.of(np.atleast_2d(array), dt_ns=self.dt_ns)
+            pulses = Pulses.of(np.atleast_2d(waveforms), dt_ns=self.dt_ns)
+            ndim = np.ndim(waveforms)
         self._by_energy(energy_kev, noise)
         kev: dict[str, Energies] = {}
         for name, values in {"energy_kev": energy_kev, "tails_kev": tails_kev}.items():
-            shape = np.shape(np.asarray(values))
+            shape = np.asarray(values).shape
             if shape not in ((), (len(pulses),)):
                 raise CpunetError(
                     f"{name} has shape {shape} for {len(pulses)} pulses; give one for each, "
@@ -197,32 +192,31 @@ class Translator:
             if values is not None:
                 kev[name] = np.broadcast_to(np.asarray(values, float), len(pulses))
         pulses = replace(pulses, energy_kev=kev.get("energy_kev", pulses.energy_kev))
-        left = kev.get("tails_kev")
         if seed is None:
             seed = int(np.random.default_rng().integers(2**63))
-        parts = [
-            self.translate_pulses(
-                pulses[rows],
-                noise=noise,
-                generator=np.random.default_rng(noise_seed(seed, None, number)),
-                tails_kev=None if left is None else left[rows],
-            )
-            for number, rows in enumerate(blocks(max(len(pulses), 1), NOISE_ROWS))
-        ]
-        done = TranslatedPulses.joined(parts)
+        done = TranslatedPulses.joined(
+            [
+                self.translate_pulses(
+                    pulses[rows],
+                    noise=noise,
+                    generator=np.random.default_rng(noise_seed(seed, None, number)),
+                    tails_kev=kev["tails_kev"][rows] if "tails_kev" in kev else None,
+                )
+                for number, rows in enumerate(blocks(max(len(pulses), 1), BATCH))
+            ]
+        )
         if reasons := counted(rejections_of(done.codes)):
             if ndim < 2:
                 raise CpunetError(f"the pulse cannot be translated: {reasons}")
             warnings.warn(
-                f"{len(done.codes) - done.valid.sum()} of {len(done.codes)} pulses cannot be "
+                f"{np.count_nonzero(done.codes)} of {len(pulses)} pulses cannot be "
                 f"translated and are rows of NaN: {reasons}",
                 RejectionWarning,
                 stacklevel=2,
             )
-        result: Any = done.pulses
-        if not isinstance(waveforms, Pulses):
-            result = result.waveforms if ndim == 2 else result.waveforms[0]
-        return result  # type: ignore[no-any-return]
+        if isinstance(waveforms, Pulses):
+            return done.pulses
+        return done.pulses.waveforms[0 if ndim < 2 else slice(None)]
 
     __call__ = translate
 
@@ -318,7 +312,12 @@ class Translator:
         by_height = self.backend.by_height is not None
         depends = by_height or (noise and self.needs_energies)
         if depends and energy_kev is None:
-            raise CpunetError(NO_HEIGHT if by_height else NO_ENERGY)
+            why = "electronic noise is scaled by 1/energy; give energy_kev, or noise=False"
+            if by_height:
+                why = (
+                    "the electronics of this run act by the height of a pulse; give energy_kev"
+                )
+            raise CpunetError(why)
         return depends
 
     def require_sampling(self, what: str, dt_ns: float) -> None:
@@ -356,7 +355,6 @@ class REN(Translator):
 
     part = "ren"
     takes = "simulated"
-    sign = 1
 
 
 class IREN(Translator):
@@ -364,4 +362,3 @@ class IREN(Translator):
 
     part = "iren"
     takes = "measured"
-    sign = -1
