@@ -199,17 +199,15 @@ class PulseFile:
 
     def open(self) -> PulseSource:
         """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
-        # HDF5 and FlashCam take a fifth of a second each to import
+        # HDF5 takes a fifth of a second to import
         read: Callable[[PulseFile], PulseSource]
         format_ = "memory" if self.pulses is not None else recognise(self.path)
         if format_ == "HDF5":
             from cpunet.pulses.reading.hdf5 import read_hdf5 as read
-        elif format_ == "FlashCam":
-            from cpunet.pulses.reading.flashcam import read_flashcam as read
         else:
-            from cpunet.pulses.reading import arrays
+            from cpunet.pulses.reading.other_formats import READERS
 
-            read = arrays.READERS[format_]
+            read = READERS[format_]
         return read(self).resolve(self)
 
 
@@ -325,7 +323,7 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
     path = Path(path)
     format_ = recognise(path)
     if format_ == "FlashCam":
-        from cpunet.pulses.reading.flashcam import channel_sizes
+        from cpunet.pulses.reading.other_formats import channel_sizes
 
         return channel_sizes(path)
     if format_ != "HDF5":

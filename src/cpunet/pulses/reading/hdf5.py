@@ -57,9 +57,8 @@ def read_hdf5(options: PulseFile) -> PulseSource:
         if isinstance(values, h5py.Dataset):
             columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
             rows = reading(path, values, lambda start, stop: np.asarray(values[start:stop]))
-            return PulseSource.of_array(
-                path, "HDF5", name, values, columns, rows=rows, **of_file
-            )
+            n, length = values.shape
+            return PulseSource(path, "HDF5", name, n, length, rows, columns, **of_file)
         own, values = columns_of(path, values), values["values"]
         # a group holds the traces encoded, or as vectors of their own lengths
         is_group, sized = isinstance(values, h5py.Group), values
@@ -77,10 +76,7 @@ def read_hdf5(options: PulseFile) -> PulseSource:
                     "continued with their last value"
                 )
         rows = reading(path, values, partial(_lh5_traces, values, longest))
-        return PulseSource(
-            path, "LH5", name, n, longest, rows, columns, period_name=f"{name}/dt",
-            period=own.get("dt"), t0=own.get("t0"), **of_file,
-        )  # fmt: skip
+        return PulseSource(path, "LH5", name, n, longest, rows, columns, own, **of_file)
 
 
 def _lh5_traces(
@@ -130,8 +126,9 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     if _is_lh5(item) or _is_array(item):
         return place
     folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
-    for link in (link for *_, broken in folders for link in broken):
-        item_at(file, link)  # which says what is wrong
+    for *_, broken in folders:
+        for link in broken:
+            item_at(file, link)  # which says what is wrong
     columns = [column for _, _, waveforms, _ in folders for column in waveforms]
     if len(columns) == 1:
         return columns[0]
@@ -141,11 +138,10 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     names = {column.rpartition("/")[2]: column for column in columns}
     best = next((name for name in _PREFERRED if name in names), None)
     if len(tables) > 1 or best is None:
-        several, what = columns, "waveform columns ("
-        if len(tables) > 1:
-            several, what = tables, "tables of waveforms ("
+        several = tables if len(tables) > 1 else columns
+        what = "tables of waveforms" if len(tables) > 1 else "waveform columns"
         raise CpunetError(
-            f"{path}: {len(several)} {what}{shortened(several)}); choose one with `table` "
+            f"{path}: {len(several)} {what} ({shortened(several)}); choose one with `table` "
             "(`sim_table`, `data_table`)"
         )
     others = ", ".join(sorted(names.keys() - {best}))

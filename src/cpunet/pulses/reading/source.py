@@ -6,7 +6,7 @@ import logging
 import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -92,14 +92,13 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         a file with fewer those that are left.
     columns
         Columns with one value per trace, by name.
+    times
+        Sampling periods ``dt`` and times of the first samples ``t0`` that are no columns.
     attrs
         What the file says about the traces: side, maker, detector.
-    period_name, period
-        Name and column of the sampling period, if it is in the file.
-    t0
-        Times of the first samples, if they are in the file.
-    numbers
-        Gives the event numbers of the traces read last, if the file has any.
+    of_each
+        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
+        ``t0_ns``, and ``dt_ns`` if there are several.
     group, close
         Group of an HDF5 file with columns of any kind; closes the file.
 
@@ -113,9 +112,6 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         The rule that gives each pulse its energy, in words.
     kev_per_adc
         The factor from the amplitude to the energy, if there are no energies.
-    of_each
-        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
-        ``t0_ns``, and ``dt_ns`` if there are several.
     """
 
     path: Path
@@ -125,11 +121,9 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     length: int
     rows: Read
     columns: dict[str, Column] = field(default_factory=dict)
+    times: dict[str, Column] = field(default_factory=dict)
     attrs: Mapping[str, str] = field(default_factory=dict)
-    period_name: str = "dt"
-    period: Column | None = None
-    t0: Column | None = None
-    numbers: Read | None = None
+    of_each: dict[str, Any] = field(default_factory=dict)
     group: h5py.Group | None = None
     close: Callable[[], None] = lambda: None
     chosen: npt.NDArray[np.int64] | None = field(default=None, init=False)
@@ -137,42 +131,6 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     dt_ns: float = field(default=np.nan, init=False)
     energies: str = field(default="", init=False)
     kev_per_adc: float | None = field(default=None, init=False)
-    of_each: dict[str, Values] = field(default_factory=dict, init=False)
-
-    @classmethod
-    def of_array(
-        cls,
-        path: Path,
-        format: str,
-        name: str,
-        values: Any,
-        columns: dict[str, Column],
-        **how: Any,
-    ) -> PulseSource:
-        """An array, in memory or stored, of shape ``(traces, samples)``, and its columns.
-
-        Raises
-        ------
-        CpunetError
-            If the columns have a value for each of its samples: Julia and MATLAB write arrays
-            with their dimensions reversed.
-        """
-        n, length = values.shape
-        sizes = {column.size for column in columns.values()}
-        if length in sizes and n not in sizes:
-            raise CpunetError(
-                f"{path}: traces of shape {values.shape} with columns of {length}: their "
-                "dimensions are reversed",
-                "write them transposed, with the pulses first",
-            )
-        how = {
-            "rows": lambda start, stop: values[start:stop],
-            "period": columns.get("dt"),
-        } | how
-        if (in_ns := columns.get("dt_ns")) is not None:
-            period = Column(in_ns.load, in_ns.size, in_ns.units or "ns")
-            how |= {"period_name": "dt_ns", "period": period}
-        return cls(path, format, name, n, length, columns=columns, **how)
 
     def resolve(self, file: PulseFile) -> Self:
         """Take the rows, the sampling period and the energies that the user chose.
@@ -182,16 +140,23 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         CpunetError
             If it holds no pulses, or those of several channels, or the options do not fit.
         """
-        if self.n_pulses == 0 or self.length == 0:
+        n, sizes = self.n_pulses, {column.size for column in self.columns.values()}
+        if n == 0 or self.length == 0:
             raise CpunetError(
                 f"{self.path}: {self.name or self.format} holds no pulses; "
                 "give a file with events"
             )
-        if self.n_pulses is not None:
-            self._choose(file.rows, self.n_pulses)
+        if self.length in sizes and n not in sizes:  # as Julia and MATLAB write arrays
+            raise CpunetError(
+                f"{self.path}: traces of shape {(n, self.length)} with columns of "
+                f"{self.length}: their dimensions are reversed",
+                "write them transposed, with the pulses first",
+            )
+        if n is not None:
+            self._choose(file.rows, n)
         self._sample(file.dt_ns)
         self._calibrate(file.energy, file.kev_per_adc)
-        if self.t0 is not None and (t0_ns := self.t0.to("ns")) is not None:
+        if "t0" in self.times and (t0_ns := self.times["t0"].to("ns")) is not None:
             self.of_each["t0_ns"] = np.broadcast_to(t0_ns, (self.n_pulses or 0,))
         if name := next((name for name in EVENT_KEYS[:-1] if name in self.columns), None):
             self.of_each["event_number"] = self._of_each(name, self.columns[name])
@@ -240,7 +205,7 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         self.chosen, self.n_all, self.n_pulses = rows, n, len(rows)
         self.rows = partial(some_of, self.rows, rows)
         self.columns = {name: column.at(rows, n) for name, column in self.columns.items()}
-        self.period, self.t0 = (c and c.at(rows, n) for c in (self.period, self.t0))
+        self.times = {name: column.at(rows, n) for name, column in self.times.items()}
 
     def _sample(self, dt_ns: float | None) -> None:
         """Take the period from the column of the file or from the user.
@@ -248,7 +213,11 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         A column without units is not used, and ``dt_ns`` is required.  A file that says
         another period than the user is corrected, with a warning.
         """
-        name, column = self.period_name, self.period
+        of = self.times if "dt" in self.times else self.columns
+        name = "dt_ns" if "dt_ns" in of else "dt"
+        column = of.get(name)
+        if column is not None and name == "dt_ns" and not column.units:
+            column = replace(column, units="ns")
         periods = None if column is None else column.to("ns")
         if column is None or periods is None:
             why = "is not in the file" if column is None else f"({name}) has no units"
@@ -260,13 +229,14 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             return
         if column.size != 1:
             self._of_each(name, column)
-        self.dt_ns = period = float(periods.flat[0])
+        period = float(periods.flat[0])
         is_period = np.isfinite(period) and period > 0
         if dt_ns is None and not is_period:
             raise CpunetError(
                 f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns",
                 "give `dt_ns`",
             )
+        self.dt_ns = period
         if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
             log.warning(
                 f"{self.path.name}: says that it is sampled every {period:g} ns; taken as "
@@ -285,41 +255,43 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         column, or ``FILE:path/to/column``.  Energies in units that are wrong or a little off
         are multiplied by ``kev_per_adc`` as well, with a warning.
         """
-        self.kev_per_adc, why = kev_per_adc, ""
-        if name := energy or next((name for name in _USUAL if name in self.columns), ""):
-            if (column := self.columns.get(name)) is None:
-                if ":" not in name:
-                    raise CpunetError(
-                        f"{self.path}: no column {name} for the energy; there are "
-                        f"{shortened(self.columns)}"
-                    )
-                from cpunet.pulses.reading import hdf5  # which other formats do not need
-
-                column = hdf5.column_elsewhere(self, name)
-            units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
-            by, rule = factor(units, "keV"), f"column {name} [{units}]"
-            if by is None and kev_per_adc is not None:
-                by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
-            elif by is not None and kev_per_adc is not None:
-                log.warning(
-                    f"{self.path.name}: column {name} is in {units}; its energies are "
-                    f"multiplied by {kev_per_adc:g}, as given (`kev_per_adc`)"
-                )
-                by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
-            if by is not None:
-                values = np.asarray(self._of_each(name, column), np.float64)
-                self.energies, self.of_each["energy_kev"] = rule, by * values
-                return
-            if energy is not None:
-                units = f"in {column.units}" if column.units else "without units"
-                raise CpunetError(
-                    f"{self.path}: column {name} is {units}, no energy in keV; "
-                    "add `kev_per_adc` (1 if it is in keV)"
-                )
-            why = f" (column {name} is not in energy units)"
-        self.energies = f"not known{why}"
+        self.kev_per_adc, self.energies = kev_per_adc, "not known"
         if kev_per_adc is not None:
             self.energies = f"amplitude x {kev_per_adc:g} keV/ADC"
+        name = energy or next((name for name in _USUAL if name in self.columns), None)
+        if name is None:
+            return
+        column = self.columns.get(name)
+        if column is None and ":" in name:
+            from cpunet.pulses.reading import hdf5  # which other formats do not need
+
+            column = hdf5.column_elsewhere(self, name)
+        if column is None:
+            raise CpunetError(
+                f"{self.path}: no column {name} for the energy; there are "
+                f"{shortened(self.columns)}"
+            )
+        units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
+        by, rule = factor(units, "keV"), f"column {name} [{units}]"
+        if by is not None and kev_per_adc is not None:
+            log.warning(
+                f"{self.path.name}: column {name} is in {units}; its energies are "
+                f"multiplied by {kev_per_adc:g}, as given (`kev_per_adc`)"
+            )
+            by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
+        elif kev_per_adc is not None:
+            by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
+        if by is not None:
+            values = np.asarray(self._of_each(name, column), np.float64)
+            self.energies, self.of_each["energy_kev"] = rule, by * values
+        elif energy is None:
+            self.energies = f"not known (column {name} is not in energy units)"
+        else:
+            units = f"in {column.units}" if column.units else "without units"
+            raise CpunetError(
+                f"{self.path}: column {name} is {units}, no energy in keV; "
+                "add `kev_per_adc` (1 if it is in keV)"
+            )
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -360,15 +332,13 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         """Traces with their energies, numbers and times."""
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(traces, np.float32)
-        n, stop = len(waveforms), start + len(waveforms)
-        of_each = {name: values[start:stop] for name, values in self.of_each.items()}
-        numbers = of_each.get("event_number", np.arange(start, stop))
-        if self.numbers is not None:
-            numbers = self.numbers(start, stop)
-        energy_kev = of_each.get("energy_kev", np.full(n, np.nan))
-        if "energy_kev" not in of_each and self.kev_per_adc is not None:
+        n = len(waveforms)
+        of_each = {name: values[start : start + n] for name, values in self.of_each.items()}
+        numbers = of_each.get("event_number", np.arange(start, start + n))
+        energy_kev = of_each.get("energy_kev")
+        if energy_kev is None and self.kev_per_adc is not None:
             energy_kev = self.kev_per_adc * amplitude(waveforms)
-        if len(energy_kev) != n:
+        if energy_kev is not None and len(energy_kev) != n:
             raise CpunetError(
                 f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
                 "give the energies of the same events"
@@ -383,10 +353,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
                 f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
                 "split the file by sampling period"
             )
+        t0_ns = of_each.get("t0_ns", 0.0)
         return Pulses.of(
-            waveforms,
-            dt_ns=self.dt_ns,
-            energy_kev=energy_kev,
-            event_number=event_number,
-            t0_ns=of_each.get("t0_ns", 0.0),
-        )
+            waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number,
+            t0_ns=t0_ns,
+        )  # fmt: skip
