@@ -19,7 +19,6 @@ from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.doubts import LOW_KEV, require_sense, rolled_over
 from cpunet.pulses.peaks import EnergySelection, label_peaks, suggested_calibration
 from cpunet.pulses.preparation import (
     Codes,
@@ -33,7 +32,13 @@ from cpunet.pulses.preparation import (
     prepare,
     rejections_of,
 )
-from cpunet.pulses.provenance import recorded_detector, require_side
+from cpunet.pulses.provenance import (
+    LOW_KEV,
+    recorded_detector,
+    require_sense,
+    require_side,
+    rolled_over,
+)  # fmt: skip
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource, amplitude
 from cpunet.recipes.schema import MatchingConfig, PreparationConfig, Recipe
@@ -410,7 +415,7 @@ def _nothing_left(
     """Why no pulse can be used, as traces or energies show it, or the most frequent reason."""
     rolled = rolled_over(traces)
     if rolled is not None and rolled.share >= FEW_ROLLED:
-        return CpunetError(f"{path}: {rolled}", rolled.remedy)
+        return CpunetError(f"{path}: {rolled.text}", rolled.remedy)
     if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
         return CpunetError(
             f"{path}: the traces go down: their polarity is negative",

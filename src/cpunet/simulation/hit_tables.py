@@ -17,7 +17,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import item_at, members, opened, units_of
 from cpunet.pulses.reading.other_formats import read_arrays
-from cpunet.pulses.reading.columns import divides, dividing, labels, texts, whole_numbers
+from cpunet.pulses.reading.source import divides, dividing, labels, texts, whole_numbers
 from cpunet.units import factor, unit_names
 
 HIT_TABLE = "geds/hits"  # the hits stored with simulated pulses: one row per hit

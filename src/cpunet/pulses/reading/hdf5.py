@@ -30,9 +30,8 @@ from cpunet.hdf5_files import (
     texts_of,
     units_of,
 )
-from cpunet.pulses.reading.columns import EVENT_KEYS, Column, divides, dividing, labels
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.reading.source import EVENT_KEYS, Column, PulseSource, divides, parts
 from cpunet.tables import shortened
 
 # preference among several waveform columns of a table: full record, then full-rate window
@@ -189,12 +188,10 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
             columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         except CpunetError:  # said where the table is opened
             columns = {}
-        rows = max((column.size for column in columns.values()), default=0)
-        whole = {n: c for n, c in columns.items() if divides(n) and c.size == rows}
-        of = {name: np.atleast_1d(column.values) for name, column in whole.items()}
-        names = dividing(of, rows)
-        parts = np.unique(labels(of, names)) if names else [""]
-        channels += [f"{table}/{part}".strip("/") for part in parts]
+        n = max((column.size for column in columns.values()), default=0)
+        whole = {name: column for name, column in columns.items() if column.size == n}
+        names = parts(whole, np.arange(n))[1] or [""]
+        channels += [f"{table}/{name}".strip("/") for name in names]
     return channels
 
 

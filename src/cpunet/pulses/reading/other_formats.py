@@ -28,9 +28,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.columns import Column
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.reading.source import Column, PulseSource
 from cpunet.tables import shortened
 
 if TYPE_CHECKING:  # a fifth of a second
