@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import re
 
-import h5py
 import numpy as np
 import pytest
 
@@ -141,19 +140,6 @@ def test_the_advice_on_counts_that_roll_over_works_on_integers(tmp_path, kind):
     heights = np.ptp(whole, axis=1) / np.ptp(counts, axis=1)
     np.testing.assert_allclose(heights, 3 if kind == "int16" else 1)
     assert ("view('uint16')" in str(error.value)) == (kind == "int16")
-
-
-@pytest.mark.parametrize("suffix", ["h5", "npz"])
-def test_reversed_dimensions_are_named(tmp_path, suffix):
-    path, energy = tmp_path / f"julia.{suffix}", kev()
-    arrays = {"waveform": traces(energy).T, "energy_kev": energy}
-    if suffix == "npz":
-        np.savez(path, **arrays)
-    else:
-        with h5py.File(path, "w") as file:
-            file.update(arrays)
-    with pytest.raises(CpunetError, match=rf"julia.*\(1400, {N}\) .* reversed; .* transposed"):
-        open_pulses(path, dt_ns=16)
 
 
 TIME = np.arange(800)

@@ -194,7 +194,8 @@ def test_a_value_that_is_not_finite_gives_nan_for_that_pulse_only(bad, sample):
     for name, values in parameters_of(waveforms, decay_ns=decay_ns).items():
         assert np.isnan(values).tolist() == [False, False, True, False, False], name
         others = [0, 1, 3, 4]
-        assert values[others] == pytest.approx(expected[name][others], rel=1e-9, abs=1e-9)
+        # matrix products of single precision round as the number of their rows
+        assert values[others] == pytest.approx(expected[name][others], rel=1e-6, abs=1e-9)
 
 
 def test_the_documented_table_is_the_registry():
@@ -241,11 +242,9 @@ def test_the_last_crossing_before_the_maximum_counts():
 
 
 def test_outside_the_record_there_is_no_value():
-    centre = 20.25
-    aligned = align_half_maximum(edge(TIME[:60] - centre, 2.5)[np.newaxis], 30, 50)[0]
-    known = np.isfinite(aligned)
+    aligned = align_half_maximum(edge(TIME[:60] - 20.25, 2.5)[np.newaxis], 30, 50)[0]
     # the crossing at 20.25 has 20 samples before it, and 38 after it, in the record
-    assert np.flatnonzero(known).tolist() == list(range(10, 69))
+    assert np.flatnonzero(np.isfinite(aligned)).tolist() == list(range(10, 69))
 
 
 NAN = np.where(TIME == 700, np.nan, edge(TIME - 350, 4.0))

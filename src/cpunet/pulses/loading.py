@@ -30,7 +30,6 @@ from cpunet.pulses.preparation import (
     apply_cuts,
     fit_cuts,
     prepare,
-    rejections_of,
 )
 from cpunet.pulses.provenance import (
     LOW_KEV,
@@ -129,10 +128,8 @@ class SideInfo(InfoPart):
     def reading(self, file: PulseFile) -> PulseFile:
         """A file with the reading options that the training had for it as defaults."""
         own = self.read_as
-        other = any(own.get(name) != value for name, value in file.options.items())
-        if other or self.place != str(file.path.resolve()):
-            return file
-        return replace(file, **own)
+        same = all(own.get(name) == value for name, value in file.options.items())
+        return replace(file, **own) if same and self.place == str(file.path.resolve()) else file
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,18 +157,15 @@ class InputSet:
     def provenance(self) -> SideInfo:
         """File, counts, and a fingerprint of the pulses used."""
         waveforms = np.ascontiguousarray(self.prepared.pulses.waveforms)
+        of_file = ("read_as", "dt_ns", "cuts", "counts", "detector")
         return SideInfo(
             file=str(self.path),
             place=str(self.path.resolve()),
-            read_as=self.read_as,
-            dt_ns=self.dt_ns,
             read=self.prepared.n_read,
             used=len(self.prepared),
             rejections=self.prepared.rejections,
-            cuts=self.cuts,
-            counts=self.counts,
             sha256=hashlib.sha256(waveforms.data).hexdigest(),
-            detector=self.detector,
+            **{name: getattr(self, name) for name in of_file},
         )
 
     def fingerprint(self) -> dict[str, str | float]:
@@ -213,10 +207,9 @@ def load_pulses(
     """
     with file.open() as source:
         require_side(source, side, SWAPPED, insist=file.insist)
-        how = (recipe, selection, max_pulses, shorten)
-        inputs, parts, whole = _read(source, file, side, *how)
+        inputs, whole = _read(source, file, side, recipe, selection, max_pulses, shorten)
     recipe, prepared = inputs.recipe.at(inputs.dt_ns), inputs.prepared
-    if side == "measured":
+    if inputs.baselines is not None:
         cuts = fit_cuts(prepared, recipe.cuts)
         prepared = apply_cuts(prepared, cuts)
         if not len(prepared):
@@ -224,7 +217,7 @@ def load_pulses(
                 f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
             )
         passed = [traces[np.isin(rows, prepared.index)] for rows, traces in whole]
-        baselines = Baselines.concatenate(parts, Pulses.concatenate(passed))
+        baselines = replace(inputs.baselines, whole=Pulses.concatenate(passed))
         inputs = replace(inputs, prepared=prepared, cuts=cuts, baselines=baselines)
     elif tell:
         ends = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
@@ -290,16 +283,17 @@ def _read(
     selection: EnergySelection,
     max_pulses: int | None,
     shorten: bool,
-) -> tuple[InputSet, list[Baselines], list[tuple[Rows, Pulses]]]:
+) -> tuple[InputSet, list[tuple[Rows, Pulses]]]:
     """Read, select, prepare and collect the pulses of a file in one pass.
 
-    Without quality cuts; also baselines, and whole traces with their rows.
+    Without quality cuts; also whole measured traces with their rows.
 
     If there are more than `max_pulses`, those with the smallest random numbers stay.  A pulse
     that is dropped early would also be dropped after all later ones were read, so they are a
     uniform sample of the whole file, always the same for the same file.
     """
-    sets, drawn, before = list[Prepared](), list[FloatColumn](), set[int]()
+    measured, before = side == "measured", set[int]()
+    sets, drawn = list[Prepared](), list[FloatColumn]()
     seen = list[tuple[FloatColumn, FloatColumn]]()
     baselines, whole = list[Baselines](), list[tuple[Rows, Pulses]]()
     first, rng, start, n = np.empty((0, 0), np.float32), np.random.default_rng(0), 0, 0
@@ -312,12 +306,11 @@ def _read(
                     recipe = _within_traces(block[:TRIED], recipe, source.path.name)
                 config = recipe.at(source.dt_ns).preparation
             # baselines are of pulses of any energy
-            of_all = side == "measured" and sum(map(len, baselines)) < TRACES
+            of_all = measured and sum(map(len, baselines)) < TRACES
             part, prepared = _selected(block, config, side, selection, before, of_all)
             if of_all:
-                like = baselines[:1]
-                baselines.append(Baselines.of_block(block, prepared, config, *like))
-            if side == "measured":
+                baselines.append(Baselines.of_block(block, prepared, config, *baselines[:1]))
+            if measured:
                 good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
                 lowest, highest = good.min(initial=lowest), good.max(initial=highest)
                 rows = part.index[: max(WHOLE - sum(len(traces) for _, traces in whole), 0)]
@@ -330,21 +323,20 @@ def _read(
                 n = _thin(sets, drawn, max_pulses)
             bar.update(len(block))
     energies, heights = map(np.concatenate, zip(*seen, strict=True))
-    if not n:
-        codes = np.concatenate([part.codes for part in sets])
-        raise _nothing_left(source.path, codes, first, energies, heights, side, selection)
     if max_pulses is not None and n > max_pulses:
         _thin(sets, drawn, max_pulses)
-    if side == "measured" and not file.insist:
-        require_sense(source.path, first, energies, heights)
     if highest >= lowest and (first == first.round()).all():
         counts = int(lowest), int(highest)
-    energies = energies[np.isfinite(energies)]
     inputs = InputSet(
-        _joined(sets), source.dt_ns, source.path, energies, recipe, None, file.options,
-        recorded_detector(source), None, counts,
+        _joined(sets), source.dt_ns, source.path, energies[np.isfinite(energies)], recipe, None,
+        file.options, recorded_detector(source),
+        Baselines.concatenate(baselines) if measured else None, counts,
     )  # fmt: skip
-    return inputs, baselines, whole
+    if not n:
+        raise _nothing_left(inputs, selection, first, heights)
+    if measured and not file.insist:
+        require_sense(source.path, first, energies, heights)
+    return inputs, whole
 
 
 def _joined(sets: list[Prepared]) -> Prepared:
@@ -404,16 +396,11 @@ def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> in
 
 
 def _nothing_left(
-    path: Path,
-    codes: Codes,
-    traces: FloatArray,
-    kev: FloatColumn,
-    amplitudes: FloatColumn,
-    side: Kind,
-    selection: EnergySelection,
+    inputs: InputSet, selection: EnergySelection, traces: FloatArray, amplitudes: FloatColumn
 ) -> CpunetError:
     """Why no pulse can be used, as traces or energies show it, or the most frequent reason."""
-    rolled = rolled_over(traces)
+    path, codes, kev = inputs.path, inputs.prepared.codes, inputs.energies_kev
+    measured, rolled = inputs.baselines is not None, rolled_over(traces)
     if rolled is not None and rolled.share >= FEW_ROLLED:
         return CpunetError(f"{path}: {rolled.text}", rolled.remedy)
     if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
@@ -421,25 +408,25 @@ def _nothing_left(
             f"{path}: the traces go down: their polarity is negative",
             "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",
         )
-    reasons = ", ".join(f"{n} {reason}" for reason, n in rejections_of(codes).items())
+    reasons = ", ".join(f"{n} {why}" for why, n in inputs.prepared.rejections.items())
     text = f"{path}: none of {len(codes)} pulses can be used ({reasons})"
     # of pulses of the wanted energies, if there are any, since these are what is missed
     wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)
     reason = int((wanted if wanted.sum() >= FEW else np.bincount(codes)).argmax())
     error = CpunetError(text, _REMEDIES[Rejection(reason)])
-    kev = kev[np.isfinite(kev)]
     if not len(kev):
         calibration = suggested_calibration(amplitudes)
-        text = f"{error}; their amplitudes look like {calibration}"
-        return error if calibration is None else CpunetError(text)
+        like = f"{error}; their amplitudes look like {calibration}"
+        return error if calibration is None else CpunetError(like)
     if selection.select(kev).any():
         return error
     low, middle, high = np.quantile(kev, (0.05, 0.5, 0.95))
-    text = f"{error}. Energies there: {low:.4g} to {high:.4g} keV, half of them above "
-    text += f"{middle:.4g}"
-    give = "give `kev_per_adc`" if side == "measured" else "multiply them in the file by"
+    text = (
+        f"{error}. Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
+    )
+    give = "give `kev_per_adc`" if measured else "multiply them in the file by"
     from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
-    if high > MAX_KEV and side == "measured":
+    if high > MAX_KEV and measured:
         text += f": if these are ADC counts, {give}"
     elif 0 < high < MIN_KEV:
         text += f": if these are MeV, {give} 1000"

@@ -215,25 +215,18 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     )
     n, length = len(pulses), config.length
     windows, codes = np.empty((n, length), np.float32), np.empty(n, np.uint8)
-    numbers, traces = np.empty((n, _kernels.COLUMNS)), np.ascontiguousarray(pulses.waveforms)
-    n = _kernels.prepare_block(traces, settings, windows, numbers, codes)
+    numbers, traces = np.empty((n, len(_kernels.NUMBERS))), pulses.waveforms
+    n = _kernels.prepare_block(np.ascontiguousarray(traces), settings, windows, numbers, codes)
     windows.resize((n, length), refcheck=False)  # releases the other rows without a copy
-    baseline, scale, align, rms, slope, tail_slope, chi2 = numbers[:n].T.copy()
-    rows, per_ms = np.flatnonzero(codes == Rejection.ACCEPTED), 1e6 / pulses.dt_ns
-    events = pulses.with_waveforms(pulses.waveforms[:, :0])[rows]
-    t0_ns = events.t0_ns + (align - config.samples_before) * pulses.dt_ns
-    return Prepared(
-        pulses=replace(events, waveforms=windows, t0_ns=t0_ns),
-        index=rows,
-        baseline=baseline,
-        scale=scale,
-        align_sample=align.astype(np.int64),
-        baseline_rms=rms,
-        baseline_slope=slope * per_ms,
-        tail_slope=tail_slope * per_ms,
-        chi2=chi2,
-        codes=codes,
-    )
+    columns = dict(zip(_kernels.NUMBERS, numbers[:n].T.copy(), strict=True))
+    align_sample = columns.pop("align_sample").astype(np.int64)
+    for name in ("baseline_slope", "tail_slope"):
+        columns[name] *= 1e6 / pulses.dt_ns  # per ms
+    rows = np.flatnonzero(codes == Rejection.ACCEPTED)
+    events = pulses.with_waveforms(traces[:, :0])[rows]
+    t0_ns = events.t0_ns + (align_sample - config.samples_before) * pulses.dt_ns
+    events = replace(events, waveforms=windows, t0_ns=t0_ns)
+    return Prepared(events, rows, codes=codes, align_sample=align_sample, **columns)
 
 
 # With fewer pulses the MAD is meaningless and no window is set.

@@ -50,38 +50,39 @@ def read_hdf5(options: PulseFile) -> PulseSource:
     with one_line(path):
         name = choose_waveforms(path, file, options.place)
         table, _, own_name = name.rpartition("/")
-        group, values = file[table or "/"], file[name]
+        group, values, times = file[table or "/"], file[name], dict[str, Column]()
         columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
-        of_file = {"attrs": attrs, "group": group, "close": file.close}
-        if isinstance(values, h5py.Dataset):
+        if is_lh5 := isinstance(values, h5py.Group):
+            times, values = columns_of(path, values), values["values"]
+        else:
             columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
-            rows = reading(path, values, lambda start, stop: np.asarray(values[start:stop]))
-            n, length = values.shape
-            return PulseSource(path, "HDF5", name, n, length, rows, columns, **of_file)
-        own, values = columns_of(path, values), values["values"]
         # a group holds the traces encoded, or as vectors of their own lengths
-        is_group, sized = isinstance(values, h5py.Group), values
-        if is_group:
+        sized = values
+        if isinstance(values, h5py.Group):
             sized = values.get("encoded_data", values).get("cumulative_length")
         n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
-        first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
-        longest = first.shape[1]
-        if n and is_group and "cumulative_length" in values and first.dtype.kind == "f":
-            lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
-            longest = int(lengths.max())
-            if lengths.min() < longest:
+        first = _traces(values, None, 0, 1) if n else np.empty((0, 0))
+        length = first.shape[1]
+        own = n and isinstance(values, h5py.Group) and "cumulative_length" in values
+        if own and first.dtype.kind == "f":
+            lengths = np.diff(np.asarray(sized[:], np.int64), prepend=0)
+            length = int(lengths.max())
+            if lengths.min() < length:
                 log.info(
-                    f"{path.name}: pulses of {lengths.min()} to {longest} samples are "
+                    f"{path.name}: pulses of {lengths.min()} to {length} samples are "
                     "continued with their last value"
                 )
-        rows = reading(path, values, partial(_lh5_traces, values, longest))
-        return PulseSource(path, "LH5", name, n, longest, rows, columns, own, **of_file)
+        rows = reading(path, values, partial(_traces, values, length))
+        return PulseSource(
+            path, "LH5" if is_lh5 else "HDF5", name, n, length, rows, columns, times, attrs,
+            group=group, close=file.close,
+        )  # fmt: skip
 
 
-def _lh5_traces(
+def _traces(
     item: h5py.Group | h5py.Dataset, length: int | None, start: int, stop: int
 ) -> npt.NDArray[Any]:
-    """Rows of LH5 traces; vectors of their own lengths are continued to `length` samples."""
+    """Rows of traces; vectors of their own lengths are continued to `length` samples."""
     plain = isinstance(item, h5py.Dataset)
     values = item[start:stop] if plain else lh5_rows(item, start, stop - start)
     if not hasattr(values, "cumulative_length"):
@@ -95,18 +96,17 @@ def _lh5_traces(
     lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
     expected = int(lengths[0]) if length is None else length
     flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
-    if not (other := lengths != expected).any():
-        return flat.reshape(len(lengths), expected)
-    first = int(other.argmax())
-    if flat.dtype.kind != "f":
+    other = lengths != expected
+    if other.any() and flat.dtype.kind != "f":
+        first = int(other.argmax())
         raise CpunetError(
             f"{item.file.filename}: event {start + first}: {lengths[first]} samples, others "
             f"have {expected}",
             "split the file by length; only ideal pulses are continued with their last one",
         )
-    last = np.cumsum(lengths) - 1
+    begins = np.cumsum(lengths) - lengths
     at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
-    return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
+    return np.asarray(flat[begins[:, np.newaxis] + at])
 
 
 def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
