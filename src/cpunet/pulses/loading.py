@@ -57,26 +57,19 @@ SHORTER_NS, MORE, TRIED = range(320, 3201, 320), 0.01, 1024
 SWAPPED = "are `sim` and `data` swapped?"
 
 
+_OR_PAD = "or allow more preparation.padding_before_ns and padding_after_ns"
 _REMEDIES = {
     Rejection.NAN: "where NaN pads pulses, continue their last value, or write them again",
     Rejection.CONSTANT: "check that these are the waveforms of a channel that was on",
     Rejection.SATURATED: "select lower energies or another channel",
-    Rejection.WINDOW_OUTSIDE_RECORD: (
-        "give longer records, or allow more preparation.padding_before_ns and padding_after_ns"
-    ),
-    Rejection.PULSE_AT_EDGE: (
-        "give records with more before and after the pulse, or allow more "
-        "preparation.padding_before_ns and padding_after_ns"
-    ),
-    Rejection.NO_PLATEAU: (
-        "give a longer preparation.after_ns: the charge is not collected in time"
-    ),
+    Rejection.WINDOW_OUTSIDE_RECORD: f"give longer records, {_OR_PAD}",
+    Rejection.PULSE_AT_EDGE: f"give records with more before and after the pulse, {_OR_PAD}",
+    Rejection.NO_PLATEAU: "give a longer preparation.after_ns: charge is collected later",
     Rejection.SECOND_PULSE: "check the rate: another pulse follows in nearly all traces",
     Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
     Rejection.TAIL_NOT_POSITIVE: "select higher energies",
     Rejection.ENERGY_UNKNOWN: (
-        "name the column of their calibrated energies (`energy`, `data_energy`), or give "
-        "`kev_per_adc`"
+        "name the column of calibrated energies (`energy`, `data_energy`) or give `kev_per_adc`"
     ),
     Rejection.ENERGY_OUTSIDE_SELECTION: "check the calibration and the selected peaks",
 }
@@ -86,12 +79,9 @@ class InfoPart(BaseModel):
     """Further entries stay as they are."""
 
     model_config = ConfigDict(
-        extra="allow",
-        frozen=True,
-        strict=True,
-        allow_inf_nan=False,
+        extra="allow", frozen=True, strict=True, allow_inf_nan=False,
         arbitrary_types_allowed=True,
-    )
+    )  # fmt: skip
 
 
 class SideInfo(InfoPart):

@@ -96,11 +96,11 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
     if side is None and not insist:
         side = apparent_side(next(source.blocks(_FIRST_PULSES)).waveforms)
     if side is not None and side.side != wanted:
-        begin = " If" if remedy.endswith("?") else "; if"
-        sure = "" if side.certain else f"{begin} they are {wanted}, say so with `insist`"
-        raise CpunetError(
-            f"{source.path}: given as {wanted} pulses, but these {side.why}", f"{remedy}{sure}"
-        )
+        if not side.certain:
+            begin = " If" if remedy.endswith("?") else "; if"
+            remedy += f"{begin} they are {wanted}, say so with `insist`"
+        text = f"{source.path}: given as {wanted} pulses, but these {side.why}"
+        raise CpunetError(text, remedy)
 
 
 def recorded_side(source: PulseSource) -> Recognised | None:
@@ -376,12 +376,10 @@ def rolled_over(traces: FloatArray) -> RolledOver | None:
     if period == 2**16 and traces[steep].min() < 0:
         because = "unsigned samples stored as signed, or "
         view = "as unsigned (values.view('uint16') in NumPy), or "
-    return RolledOver(
-        share,
-        f"{100 * share:.0f} % of the traces jump by {period} = 2^{period.bit_length() - 1} "
-        f"counts: {because}counts beyond the range rolled over",
-        f"write them {view}as numpy.unwrap(values.astype(float), period={period})",
-    )
+    text = f"{100 * share:.0f} % of the traces jump by {period} = 2^{period.bit_length() - 1} "
+    text += f"counts: {because}counts beyond the range rolled over"
+    remedy = f"write them {view}as numpy.unwrap(values.astype(float), period={period})"
+    return RolledOver(share, text, remedy)
 
 
 def mismatched(kev: Values, amplitudes: Values) -> float:

@@ -17,19 +17,8 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from cpunet import hdf5_files as h5
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import (
-    is_column,
-    item_at,
-    lh5_rows,
-    members,
-    one_line,
-    open_hdf5,
-    reading,
-    text_attribute,
-    texts_of,
-    units_of,
-)
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import EVENT_KEYS, Column, PulseSource, divides, parts
 from cpunet.tables import shortened
@@ -46,12 +35,12 @@ _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
 
 def read_hdf5(options: PulseFile) -> PulseSource:
     """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
-    path, file = options.path, open_hdf5(options.path)
-    with one_line(path):
+    path, file = options.path, h5.open_hdf5(options.path)
+    with h5.one_line(path):
         name = choose_waveforms(path, file, options.place)
         table, _, own_name = name.rpartition("/")
         group, values, times = file[table or "/"], file[name], dict[str, Column]()
-        columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
+        columns, attrs = columns_of(path, group), h5.texts_of(file) | h5.texts_of(group)
         if is_lh5 := isinstance(values, h5py.Group):
             times, values = columns_of(path, values), values["values"]
         else:
@@ -72,7 +61,7 @@ def read_hdf5(options: PulseFile) -> PulseSource:
                     f"{path.name}: pulses of {lengths.min()} to {length} samples are "
                     "continued with their last value"
                 )
-        rows = reading(path, values, partial(_traces, values, length))
+        rows = h5.reading(path, values, partial(_traces, values, length))
         return PulseSource(
             path, "LH5" if is_lh5 else "HDF5", name, n, length, rows, columns, times, attrs,
             group=group, close=file.close,
@@ -84,7 +73,7 @@ def _traces(
 ) -> npt.NDArray[Any]:
     """Rows of traces; vectors of their own lengths are continued to `length` samples."""
     plain = isinstance(item, h5py.Dataset)
-    values = item[start:stop] if plain else lh5_rows(item, start, stop - start)
+    values = item[start:stop] if plain else h5.lh5_rows(item, start, stop - start)
     if not hasattr(values, "cumulative_length"):
         traces = np.asarray(getattr(values, "nda", values))
         if traces.ndim != 2 or traces.dtype.kind not in "iuf":
@@ -118,7 +107,7 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
         If there is no such table, or not exactly one choice; the message lists the choices.
     """
     place = (table or "").strip("/")
-    item = item_at(file, place)
+    item = h5.item_at(file, place)
     if item is None:
         tables = waveform_tables(file) or list(file)
         raise CpunetError(f"{path}: no table {place}; there are {shortened(tables)}")
@@ -127,7 +116,7 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
     for *_, broken in folders:
         for link in broken:
-            item_at(file, link)  # which says what is wrong
+            h5.item_at(file, link)  # which says what is wrong
     columns = [column for _, _, waveforms, _ in folders for column in waveforms]
     if len(columns) == 1:
         return columns[0]
@@ -184,7 +173,7 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
     channels: list[str] = []
     for table in waveform_tables(file):
         try:
-            group = item_at(file, table) or file
+            group = h5.item_at(file, table) or file
             columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         except CpunetError:  # said where the table is opened
             columns = {}
@@ -211,10 +200,10 @@ def _folders(
     items, broken = dict[str, h5py.Group | h5py.Dataset](), list[str]()
     for name in group:
         try:
-            items[name] = item_at(group, name)
+            items[name] = h5.item_at(group, name)
         except CpunetError:
             broken.append(name)
-    is_table = text_attribute(group, "datatype").startswith("table")
+    is_table = h5.text_attribute(group, "datatype").startswith("table")
     names = [name for name, item in items.items() if _is_lh5(item)]
     names = names or [name for name in _PLAIN if _is_array(items.get(name))][:1]
     if is_table and {"dt", "values"} <= items.keys():
@@ -231,24 +220,24 @@ def _folders(
 def _is_lh5(item: object) -> bool:
     """Whether an item is an LH5 waveform table (t0, dt, values)."""
     is_group = isinstance(item, h5py.Group) and {"dt", "values"} <= item.keys()
-    return is_group and text_attribute(item, "datatype").startswith("table")
+    return is_group and h5.text_attribute(item, "datatype").startswith("table")
 
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numbers, and texts where they separate channels."""
 
     def load(item: h5py.Dataset) -> npt.NDArray[Any]:
-        with one_line(path):
+        with h5.one_line(path):
             values = np.asarray(item[()])
         return values.ravel() if values.ndim else values
 
     columns = {}
-    for name, item in members(group).items():
+    for name, item in h5.members(group).items():
         # MATLAB has no vectors, but writes a row
-        is_number = is_column(item) or (_is_array(item) and 1 in item.shape)
+        is_number = h5.is_column(item) or (_is_array(item) and 1 in item.shape)
         is_text = isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
         if is_number or (is_text and divides(name)):
-            columns[name] = Column(partial(load, item), item.size, units_of(item))
+            columns[name] = Column(partial(load, item), item.size, h5.units_of(item))
     return columns
 
 
@@ -262,9 +251,9 @@ def column_elsewhere(source: PulseSource, column: str) -> Column:
     """
     path, place = Path(column.rpartition(":")[0]), column.rpartition(":")[2].strip("/")
     folder, _, own = place.rpartition("/")
-    file = open_hdf5(path)
-    with one_line(path):
-        group = item_at(file, folder)
+    file = h5.open_hdf5(path)
+    with h5.one_line(path):
+        group = h5.item_at(file, folder)
         columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         names = list(columns or file)
     if own not in columns:

@@ -157,9 +157,8 @@ def dividing(columns: Mapping[str, Values], rows: int) -> list[str]:
     """
     chosen, groups, parts = list[str](), 1, np.zeros(rows, np.int64)
     coded = {name: np.unique(v, return_inverse=True) for name, v in columns.items()}
-    for name, (values, code) in sorted(
-        coded.items(), key=lambda item: (-len(item[1][0]), item[0])
-    ):
+    for name in sorted(coded, key=lambda name: (-len(coded[name][0]), name)):
+        values, code = coded[name]
         both, joined = np.unique(parts * len(values) + code, return_inverse=True)
         if groups < len(both) <= min(_MOST, rows / _FEWEST):
             chosen, groups, parts = [*chosen, name], len(both), joined
