@@ -93,14 +93,14 @@ def test_energies_of_another_file(file, tmp_path, raw):
     hit = write_table(tmp_path / "hit.lh5", "ch1/hit", E_cal=np.arange(N) * 1.5)
     write_table(hit, "ch1/short", E_cal=np.arange(3.0))
     blocks = list(open_pulses(file, energy=f"{hit}:ch1/hit/E_cal").blocks(4))
-    energies = np.concatenate([block.energy_kev for block in blocks])
-    np.testing.assert_array_equal(energies, np.arange(N) * 1.5)
-    with pytest.raises(CpunetError, match=rf"has 3 values for {N} waveforms"):
-        open_pulses(file, energy=f"{hit}:ch1/short/E_cal")
-    with pytest.raises(CpunetError, match=r"hit.lh5: no column ch1/hit/x; there are E_cal"):
-        open_pulses(file, energy=f"{hit}:ch1/hit/x")
-    with pytest.raises(CpunetError, match=r"gone.lh5: no such file"):
-        open_pulses(file, energy=f"{tmp_path / 'gone.lh5'}:ch1/hit/x")
+    np.testing.assert_array_equal(Pulses.concatenate(blocks).energy_kev, np.arange(N) * 1.5)
+    for column, said in (
+        (f"{hit}:ch1/short/E_cal", rf"has 3 values for {N} waveforms"),
+        (f"{hit}:ch1/hit/x", r"hit.lh5: no column ch1/hit/x; there are E_cal"),
+        (f"{tmp_path / 'gone.lh5'}:ch1/hit/x", r"gone.lh5: no such file"),
+    ):
+        with pytest.raises(CpunetError, match=said):
+            open_pulses(file, energy=column)
 
 
 def test_several_tables_need_a_choice(file, raw):
@@ -160,11 +160,9 @@ def test_memory_does_not_grow_with_the_file(file):
     source = open_pulses(file)
     next(source.blocks(size))
     tracemalloc.start()
-    try:
-        assert sum(len(block) for block in source.blocks(size)) == n
-        peak = tracemalloc.get_traced_memory()[1]
-    finally:
-        tracemalloc.stop()
+    assert sum(map(len, source.blocks(size))) == n
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
     assert peak < 5e6
 
 
@@ -229,22 +227,13 @@ def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path):
     build_dsp = pytest.importorskip("dspeed").build_dsp
     path, pulses = tmp_path / "pulses.lh5", some(20, 30)
     write_pulses(path, pulses, table="geds/raw", waveform_units="ADC", attrs={"run": "r001"})
-    largest = {
-        "function": "amax",
-        "module": "numpy",
-        "args": ["waveform", 1, "wf_max"],
-        "kwargs": {"signature": "(n),()->()", "types": ["fi->f"]},
-    }
-    build_dsp(
-        raw_in=str(path),
-        dsp_out=str(tmp_path / "dsp.lh5"),
-        dsp_config={"outputs": ["wf_max"], "processors": {"wf_max": largest}},
-        lh5_tables=["geds/raw"],
-        buffer_len=8,
-        block_width=4,
-    )
-    (name,) = (n for n in lh5.ls(str(tmp_path / "dsp.lh5"), "geds/*") if n != "dsp_info")
-    found = lh5.read(f"{name}/wf_max", str(tmp_path / "dsp.lh5")).nda
+    largest = {"function": "amax", "module": "numpy", "args": ["waveform", 1, "wf_max"]}
+    largest["kwargs"] = {"signature": "(n),()->()", "types": ["fi->f"]}
+    chain = {"outputs": ["wf_max"], "processors": {"wf_max": largest}}
+    files, sizes = (str(path), str(tmp_path / "dsp.lh5")), {"buffer_len": 8, "block_width": 4}
+    build_dsp(*files, dsp_config=chain, lh5_tables=["geds/raw"], **sizes)
+    (name,) = (n for n in lh5.ls(files[1], "geds/*") if n != "dsp_info")
+    found = lh5.read(f"{name}/wf_max", files[1]).nda
     np.testing.assert_allclose(found, pulses.waveforms.max(axis=1))
 
 

@@ -439,18 +439,20 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
         If a selected line or range has pulses on one side only.
     """
     for part in selection.parts:
-        sides = (sim, data)
-        counts = [int(part.select(side.prepared.pulses.energy_kev).sum()) for side in sides]
-        if max(counts) == 0:
+        counts = {
+            side: int(part.select(side.prepared.pulses.energy_kev).sum())
+            for side in (sim, data)
+        }
+        missing, other = sorted(counts, key=lambda side: counts[side])
+        if not counts[other]:
             raise CpunetError(
                 f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be used",
                 "leave it out of `peak`",
             )
-        if min(counts) == 0:
-            missing, other = sides if counts[0] == 0 else (data, sim)
+        if not counts[missing]:
             raise CpunetError(
                 f"{missing.path}: no pulse of {part.name} can be used, {other.path.name} has "
-                f"{max(counts)}",
+                f"{counts[other]}",
                 "leave it out of `peak`, or give a file that has them",
             )
     lines = selection.lines_in_ranges

@@ -144,12 +144,9 @@ class Prepared:
         pulses = Pulses.concatenate([s.pulses for s in sets])
         starts = np.cumsum([0, *(s.n_read for s in sets[:-1])])
         index = [s.index + start for s, start in zip(sets, starts, strict=True)]
-        joined = {
-            name: np.concatenate([getattr(s, name) for s in sets])
-            for name in (*_PER_PULSE, "codes")
-            if name not in ("pulses", "index")
-        }
-        return cls(pulses=pulses, index=np.concatenate(index), **joined)
+        names = (*_PER_PULSE[2:], "codes")  # the first two are joined already
+        joined = {name: np.concatenate([getattr(s, name) for s in sets]) for name in names}
+        return cls(pulses, np.concatenate(index), **joined)
 
 
 _PER_PULSE = tuple(f.name for f in fields(Prepared) if f.name != "codes")
@@ -290,12 +287,8 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
         raise CpunetError("no pulses to draw quality cuts from; select more energies or files")
     amplitude = float(np.median(prepared.scale))
     noise = float(np.median(prepared.baseline_rms * prepared.scale))
-    sigmas = {
-        "tail_slope": config.decay_sigmas,
-        "chi2": config.chi2_sigmas,
-        "baseline": config.baseline_sigmas,
-        "baseline_slope": config.baseline_sigmas,
-    }
+    sigmas = {"tail_slope": config.decay_sigmas, "chi2": config.chi2_sigmas}
+    sigmas |= dict.fromkeys(("baseline", "baseline_slope"), config.baseline_sigmas)
     windows = []
     for name, k in sigmas.items():
         values, weights = _values(prepared, name, amplitude, noise)

@@ -103,25 +103,20 @@ def read_numpy(options: PulseFile) -> PulseSource:
         )
     usual = [name for name in _WAVEFORMS if name in matrices and options.place is None]
     name = options.chosen_of(usual or matrices, "array", "arrays of two dimensions")
+    numbers = {n: v for n, v in arrays.items() if v.dtype.kind in "iufb" and n != name}
     columns = {
         column: Column.of(values.ravel() if values.ndim else values)
-        for column, values in arrays.items()
-        if (values.ndim <= 1 or 1 in values.shape)
-        and values.dtype.kind in "iufb"
-        and column != name
+        for column, values in numbers.items()
+        if values.ndim <= 1 or 1 in values.shape
     }
     return _of_array(options.path, "NumPy", name, arrays[name], columns)
 
 
 # NumPy 1 calls its package numpy.core, NumPy 2 numpy._core
-_ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")} | {
-    (f"numpy.{core}.{module}", name)
-    for core in ("core", "_core")
-    for module, name in (
-        ("multiarray", "_reconstruct"),
-        ("multiarray", "scalar"),
-        ("numeric", "_frombuffer"),
-    )
+_CORE = {"_reconstruct": "multiarray", "scalar": "multiarray", "_frombuffer": "numeric"}
+_ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")}
+_ALLOWED |= {
+    (f"numpy.{core}.{_CORE[name]}", name) for core in ("core", "_core") for name in _CORE
 }
 _OTHERS = "write the pulses of one length without other entries"
 

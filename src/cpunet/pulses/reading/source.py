@@ -9,7 +9,7 @@ import logging
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
@@ -357,27 +357,25 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         of = self.times if "dt" in self.times else self.columns
         name = "dt_ns" if "dt_ns" in of else "dt"
         column = of.get(name)
-        if column is not None and name == "dt_ns" and not column.units:
-            column = replace(column, units="ns")
-        periods = None if column is None else column.to("ns")
-        if column is None or periods is None:
+        units = "" if column is None else column.units or ("ns" if name == "dt_ns" else "")
+        if column is None or (by := factor(units, "ns")) is None:
             why = "is not in the file" if column is None else f"({name}) has no units"
-            if column is not None and column.units:
-                why = f"({name}) is in {column.units!r}, not in one of {unit_names('ns')}"
+            if units:
+                why = f"({name}) is in {units!r}, not in one of {unit_names('ns')}"
             if dt_ns is None:
                 raise CpunetError(f"{self.path}: the sampling period {why}; give `dt_ns`")
             self.dt_ns = dt_ns
             return
         if column.size != 1:
             self._of_each(name, column)
-        period = float(periods.flat[0])
+        periods = by * np.asarray(column.values, np.float64)
+        self.dt_ns = period = float(periods.flat[0])
         is_period = np.isfinite(period) and period > 0
         if dt_ns is None and not is_period:
             raise CpunetError(
                 f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns",
                 "give `dt_ns`",
             )
-        self.dt_ns = period
         if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
             log.warning(
                 f"{self.path.name}: says that it is sampled every {period:g} ns; taken as "
