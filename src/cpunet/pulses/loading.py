@@ -240,20 +240,19 @@ def _within_traces(block: Pulses, recipe: Recipe, name: str) -> Recipe:
     if np.mean((raw >= half).argmax(axis=1) > raw.shape[1] - needed) <= MORE:
         return recipe
 
-    def outside(recipe: Recipe) -> float:
-        codes = prepare(block, recipe.at(dt_ns).preparation, "measured").codes
-        edge = np.isin(codes, (Rejection.PULSE_AT_EDGE, Rejection.WINDOW_OUTSIDE_RECORD))
-        return float(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
-
-    tried = [recipe]
-    for by in SHORTER_NS:
+    tried, outside = list[Recipe](), list[float]()
+    for by in (0, *SHORTER_NS):
         after, decay = windows.after_ns - by, windows.decay_fit_ns - by
-        if min(after - training.level_ns, decay) > 0:
-            to = {"after_ns": after, "decay_fit_ns": decay}
-            within = training.model_copy(update={"after_ns": min(training.after_ns, after)})
-            changed = {"preparation": windows.model_copy(update=to), "training": within}
-            tried.append(recipe.model_copy(update=changed))
-    shares = np.array([outside(shorter) for shorter in tried])
+        if by and min(after - training.level_ns, decay) <= 0:
+            break
+        to = {"after_ns": after, "decay_fit_ns": decay}
+        within = training.model_copy(update={"after_ns": min(training.after_ns, after)})
+        changed = {"preparation": windows.model_copy(update=to), "training": within}
+        tried.append(recipe.model_copy(update=changed))
+        codes = prepare(block, tried[-1].at(dt_ns).preparation, "measured").codes
+        edge = np.isin(codes, (Rejection.PULSE_AT_EDGE, Rejection.WINDOW_OUTSIDE_RECORD))
+        outside.append(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
+    shares = np.array(outside)
     if shares[0] - shares.min() <= MORE:
         return recipe
     best = tried[int(np.argmax(shares <= shares.min() + 0.5 * MORE))]

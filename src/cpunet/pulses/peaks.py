@@ -60,13 +60,15 @@ def label_peaks(
     >>> label_peaks([2610.0, 1000.0, np.nan], lines).tolist()
     ['FEP', '', '']
     """
-    energies = np.asarray(energy_kev, np.float64)
-    names: npt.NDArray[np.str_] = np.array(["", *peaks])
+    energies, names = np.asarray(energy_kev, np.float64), np.array(["", *peaks])
     lines = [(0.0, -1.0), *((peak.energy_kev, peak.half_width_kev) for peak in peaks.values())]
     centres, widths = np.transpose(lines)
     # NaN is in no window, since every comparison with it is false.
     distance = np.abs(energies[:, np.newaxis] - centres)
-    return names[np.where(distance <= widths, distance, np.inf).argmin(axis=1)]
+    nearest: npt.NDArray[np.intp] = np.where(distance <= widths, distance, np.inf).argmin(
+        axis=1
+    )
+    return names[nearest]
 
 
 @dataclass(frozen=True)

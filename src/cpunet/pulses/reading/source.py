@@ -102,11 +102,6 @@ class Column:
         """All values, which are read when they are asked for."""
         return self.load()
 
-    def to(self, unit: str) -> npt.NDArray[np.float64] | None:
-        """The values in ns or keV, see `cpunet.units`; None if they are in no such units."""
-        by = factor(self.units, unit)
-        return None if by is None else by * np.asarray(self.values, np.float64)
-
     def at(self, rows: npt.NDArray[np.int64], n: int | None) -> Column:
         """The values of some of `n` rows; a number for all stays."""
         if self.size != n:
@@ -299,8 +294,9 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             self._choose(file.rows, n)
         self._sample(file.dt_ns)
         self._calibrate(file.energy, file.kev_per_adc)
-        if "t0" in self.times and (t0_ns := self.times["t0"].to("ns")) is not None:
-            self.of_each["t0_ns"] = np.broadcast_to(t0_ns, (self.n_pulses or 0,))
+        t0 = self.times.get("t0")
+        if t0 is not None and (by := factor(t0.units, "ns")) is not None:
+            self.of_each["t0_ns"] = np.broadcast_to(by * t0.values, (self.n_pulses or 0,))
         if name := next((name for name in EVENT_KEYS[:-1] if name in self.columns), None):
             self.of_each["event_number"] = self._of_each(name, self.columns[name])
         return self
