@@ -43,10 +43,8 @@ def traces(energies: np.ndarray, length: int = 1400, sign: int = 1) -> np.ndarra
     return np.rint(BASE + sign * GAIN * energies[:, np.newaxis] * shape + noise)
 
 
-def written(path, waveforms, energies, numbers=None) -> PulseFile:
-    write_pulses(
-        path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies, event_number=numbers)
-    )
+def written(path, waveforms, energies) -> PulseFile:
+    write_pulses(path, Pulses.of(waveforms, dt_ns=DT_NS, energy_kev=energies))
     return PulseFile(path)
 
 
@@ -66,12 +64,10 @@ def test_energies_of_other_pulses_are_refused_unless_insisted(tmp_path, wrong):
 
     As in https://github.com/XENON1T/pax/issues/211, https://github.com/AxFoundation/strax/issues/177.
     """
-    energies, counts = kev(), traces(kev())
-    if wrong == "order":
-        energies = np.roll(energies, 1)
-    elif wrong == "saturated":
+    energies, counts = np.roll(kev(), wrong == "order"), traces(kev())
+    if wrong == "saturated":
         counts = np.minimum(counts, 9000) + np.random.default_rng(5).integers(0, 3, (N, 1400))
-    else:
+    if wrong == "padded":
         counts[::2, :350] = 0
     file = written(tmp_path / "raw.lh5", counts, energies)
     with pytest.raises(CpunetError, match=r"% of amplitudes and energies do not go together"):
@@ -178,8 +174,8 @@ def adc(pulses: np.ndarray, noise: float = 8.0, gain: float = 30_000.0) -> np.nd
 )
 def test_the_look(pulses, side):
     found = apparent_side(pulses)
-    assert (None if found is None else found.side) == side
-    assert found is None or not found.certain
+    assert (found and found.side) == side
+    assert not (found and found.certain)
 
 
 def source_of(path, waveforms, **attrs):
@@ -201,9 +197,8 @@ def source_of(path, waveforms, **attrs):
     ],
 )
 def test_what_a_file_says(tmp_path, attrs, side):
-    source = source_of(tmp_path / "pulses.lh5", charge(), **attrs)
-    found = recorded_side(source)
-    assert (None if found is None else found.side) == side
+    found = recorded_side(source_of(tmp_path / "pulses.lh5", charge(), **attrs))
+    assert (found and found.side) == side
     assert found is None or found.certain
 
 

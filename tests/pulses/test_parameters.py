@@ -39,8 +39,7 @@ def multi_site(n: int, noise: float, seed: int) -> np.ndarray:
     rng = np.random.default_rng(seed)
     pulses = np.zeros((n, len(TIME)))
     for _ in range(3):
-        centre = rng.uniform(250, 395, (n, 1))
-        height = rng.uniform(0, 1, (n, 1))
+        centre, height = rng.uniform(250, 395, (n, 1)), rng.uniform(0, 1, (n, 1))
         pulses += height * ndtr((TIME - centre) / rng.uniform(0.5, 12, (n, 1)))
     pulses *= np.exp(-np.clip(TIME - 400, 0, None) / 3400) / pulses.max(axis=1, keepdims=True)
     return (pulses + rng.normal(0, noise, pulses.shape)).astype(np.float32)
@@ -69,11 +68,8 @@ def test_current_amplitude_equals_the_production_chain(noise):
 
 def test_current_amplitude_finds_a_maximum_far_from_the_steepest_sample():
     # a lone spike of one sample is averaged away, a broad ramp elsewhere is not
-    pulse = np.clip((TIME - 600) / 20, 0, 1)
-    pulse[100] += 0.08
-    assert current_amplitude(pulse[np.newaxis].astype(np.float32), 16.0) == pytest.approx(
-        0.05, 1e-4
-    )
+    pulse = np.float32(np.clip((TIME - 600) / 20, 0, 1) + 0.08 * (TIME == 100))
+    assert current_amplitude(pulse[np.newaxis], 16.0) == pytest.approx(0.05, 1e-4)
 
 
 def sampled(decay_ns: float, dt_ns: float, means: bool) -> np.ndarray:
@@ -134,13 +130,11 @@ def parameters_of(waveforms: np.ndarray, **how: float) -> dict[str, np.ndarray]:
 @pytest.mark.parametrize("samples", [30, 97, 200])
 def test_times_and_areas_of_a_ramp(samples):
     found = parameters_of(np.clip((TIME - 400 + samples) / samples, 0, 1))
-    rise_ns = samples * DT_NS
-    for name, fraction in TIME_POINTS.items():
-        assert found[name] == pytest.approx((fraction - 1) * rise_ns, abs=0.01)
-    for low, high in ((10, 90), (1, 90), (1, 99), (10, 99), (90, 99)):
-        wanted = (high - low) / 100 * rise_ns
-        assert found[f"rise_{low:02}_{high}"] == pytest.approx(wanted, abs=0.01)
-    assert found["drift_time"] == pytest.approx(0.99 * rise_ns, abs=0.01)
+    shares = {name: fraction - 1 for name, fraction in TIME_POINTS.items()}
+    rises = ((10, 90), (1, 90), (1, 99), (10, 99), (90, 99))
+    shares |= {f"rise_{low:02}_{high}": (high - low) / 100 for low, high in rises}
+    for name, share in (shares | {"drift_time": 0.99}).items():
+        assert found[name] == pytest.approx(share * samples * DT_NS, abs=0.01)
 
 
 @pytest.mark.parametrize("decay_us", [np.inf, 60.0])
@@ -151,8 +145,9 @@ def test_quantities_of_legend_of_a_ramp_that_decays(samples, decay_us):
     kept = np.exp(-DT_NS / (1e3 * decay_us))
     pulse = scipy.signal.lfilter([1, -1], [1, -kept], ramp)
     found = parameters_of(pulse)
-    for name, share in (("tp_50", 0.5), ("tp_90", 0.9), ("tp_99", 0.99)):
-        assert found[name] == pytest.approx((share - 1) * rise_ns, abs=0.02 * rise_ns)
+    for percent in (50, 90, 99):
+        wanted = (percent / 100 - 1) * rise_ns
+        assert found[f"tp_{percent}"] == pytest.approx(wanted, abs=0.02 * rise_ns)
     assert found["rise_time"] == pytest.approx(0.8 * rise_ns, rel=0.01)
     assert found["tp_0_est"] == pytest.approx(-rise_ns, abs=3 * DT_NS)
     # the filter finds the begin somewhat late
@@ -179,8 +174,7 @@ def test_the_three_parameters_of_the_paper_are_among_them():
         np.testing.assert_array_equal(found[name], values)
         assert SHAPE_PARAMETERS[name].axis_label == PARAMETERS[name].axis_label
     for values in found.values():
-        assert values.dtype == np.float64
-        assert values.shape == (20,)
+        assert (values.dtype, values.shape) == (np.float64, (20,))
         assert np.isfinite(values).all()
 
 
@@ -201,11 +195,10 @@ def test_a_value_that_is_not_finite_gives_nan_for_that_pulse_only(bad, sample):
 def test_the_documented_table_is_the_registry():
     page = Path(__file__).parents[2] / "docs" / "parameters.md"
     rows = [line for line in page.read_text().splitlines() if line.startswith("| `")]
-    told = [[cell.strip() for cell in row.split("|")[1:-1]] for row in rows]
-    assert [cells[:2] for cells in told] == [
-        [f"`{name}`", one.unit] for name, one in SHAPE_PARAMETERS.items()
-    ]
-    assert all(definition and source for _, _, definition, source in told)
+    names, units, *words = zip(*(map(str.strip, r.split("|")[1:-1]) for r in rows), strict=True)
+    assert names == tuple(f"`{name}`" for name in SHAPE_PARAMETERS)
+    assert units == tuple(parameter.unit for parameter in SHAPE_PARAMETERS.values())
+    assert all(all(column) for column in words)
 
 
 def edge(time: np.ndarray, sigma: float) -> np.ndarray:

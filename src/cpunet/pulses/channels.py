@@ -158,8 +158,10 @@ def each_channel(channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R])
                 log.info(f"{name}: failed: {outcome}")
             else:
                 done[name] = outcome
-    in_order = ({name: of[name] for name in channels if name in of} for of in (done, failed))
-    return Outcome(*in_order)
+    return Outcome(
+        {name: done[name] for name in channels if name in done},
+        {name: failed[name] for name in channels if name in failed},
+    )
 
 
 def _one_channel(

@@ -94,13 +94,12 @@ class Pulses:
         """Build a set from array-likes, with defaults for unknown quantities."""
         values = _numbers(waveforms, np.float32, "waveforms")
         n = len(values)
-        kev = _numbers(
-            np.full(n, np.nan) if energy_kev is None else energy_kev, float, "energy_kev"
-        )
+        kev = np.full(n, np.nan) if energy_kev is None else energy_kev
         numbers = np.asarray(np.arange(n) if event_number is None else event_number, np.int64)
         peaks = np.full(n, "") if peak is None else np.asarray(peak, np.str_)
         times = np.broadcast_to(np.asarray(t0_ns, float), (n,))
-        return cls(values, float(dt_ns), kev, numbers, peaks, times)
+        energies = _numbers(kev, np.float64, "energy_kev")
+        return cls(values, float(dt_ns), energies, numbers, peaks, times)
 
     def __len__(self) -> int:
         return len(self.waveforms)

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
+from cpunet.pulses import provenance
 from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.peaks import EnergySelection, label_peaks, suggested_calibration
@@ -31,13 +32,6 @@ from cpunet.pulses.preparation import (
     fit_cuts,
     prepare,
 )
-from cpunet.pulses.provenance import (
-    LOW_KEV,
-    recorded_detector,
-    require_sense,
-    require_side,
-    rolled_over,
-)  # fmt: skip
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource, amplitude
 from cpunet.recipes.schema import MatchingConfig, PreparationConfig, Recipe
@@ -196,7 +190,7 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     with file.open() as source:
-        require_side(source, side, SWAPPED, insist=file.insist)
+        provenance.require_side(source, side, SWAPPED, insist=file.insist)
         inputs, whole = _read(source, file, side, recipe, selection, max_pulses, shorten)
     recipe, prepared = inputs.recipe.at(inputs.dt_ns), inputs.prepared
     if inputs.baselines is not None:
@@ -318,13 +312,13 @@ def _read(
         counts = int(lowest), int(highest)
     inputs = InputSet(
         _joined(sets), source.dt_ns, source.path, energies[np.isfinite(energies)], recipe, None,
-        file.options, recorded_detector(source),
+        file.options, provenance.recorded_detector(source),
         Baselines.concatenate(baselines) if measured else None, counts,
     )  # fmt: skip
     if not n:
         raise _nothing_left(inputs, selection, first, heights)
     if measured and not file.insist:
-        require_sense(source.path, first, energies, heights)
+        provenance.require_sense(source.path, first, energies, heights)
     return inputs, whole
 
 
@@ -389,7 +383,7 @@ def _nothing_left(
 ) -> CpunetError:
     """Why no pulse can be used, as traces or energies show it, or the most frequent reason."""
     path, codes, kev = inputs.path, inputs.prepared.codes, inputs.energies_kev
-    measured, rolled = inputs.baselines is not None, rolled_over(traces)
+    measured, rolled = inputs.baselines is not None, provenance.rolled_over(traces)
     if rolled is not None and rolled.share >= FEW_ROLLED:
         return CpunetError(f"{path}: {rolled.text}", rolled.remedy)
     if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
@@ -414,7 +408,7 @@ def _nothing_left(
         f"{error}. Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
     )
     give = "give `kev_per_adc`" if measured else "multiply them in the file by"
-    from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
+    from_kev = max(np.floor(low / 100) * 100, provenance.LOW_KEV)
     if high > MAX_KEV and measured:
         text += f": if these are ADC counts, {give}"
     elif 0 < high < MIN_KEV:
