@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +27,7 @@ from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 Values = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Parameter:
+class Parameter(NamedTuple):
     """Label and unit of a parameter for an axis."""
 
     label: str

@@ -13,7 +13,6 @@ import logging
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -53,8 +52,7 @@ _SMALL = 1e-5  # of the height: rounding of a flat line
 _MIN_END = 0.98  # of the height: without electronics a pulse ends at its maximum
 
 
-@dataclass(frozen=True)
-class Recognised:
+class Recognised(NamedTuple):
     """Recognised side of a set of pulses.
 
     Parameters

@@ -61,7 +61,11 @@ def read_hdf5(options: PulseFile) -> PulseSource:
                     f"{path.name}: pulses of {lengths.min()} to {length} samples are "
                     "continued with their last value"
                 )
-        rows = h5.reading(path, values, partial(_traces, values, length))
+
+        def rows(start: int, stop: int) -> npt.NDArray[Any]:
+            with h5.one_line(path):
+                return _traces(values, length, start, stop)
+
         return PulseSource(
             path, "LH5" if is_lh5 else "HDF5", name, n, length, rows, columns, times, attrs,
             group=group, close=file.close,

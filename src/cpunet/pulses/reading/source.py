@@ -25,7 +25,6 @@ from cpunet.units import factor, unit_names
 if TYPE_CHECKING:  # of libraries that other formats do not need
     import h5py
 
-    from cpunet.hdf5_files import Read
     from cpunet.pulses.reading.files import PulseFile
 
 log = logging.getLogger(__name__)
@@ -71,6 +70,7 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
 
 
 Values = npt.NDArray[Any]
+Read = Callable[[int, int], Values]  # rows from one to before another
 Texts = npt.NDArray[np.str_]
 
 
