@@ -100,12 +100,10 @@ class Baselines:
         return cls(first, replace(prepared, pulses=no_windows), before, height, length)
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Baselines], whole: Pulses | None = None) -> Self:
+    def concatenate(cls, parts: Sequence[Baselines]) -> Self:
         """Baselines of consecutive blocks."""
         first = Pulses.concatenate([part.first for part in parts])
         prepared = Prepared.concatenate([part.prepared for part in parts])
-        before, height = (
-            np.concatenate([getattr(part, name) for part in parts])
-            for name in ("before", "height")
-        )
-        return cls(first, prepared, before, height, parts[0].length, whole)
+        before = np.concatenate([part.before for part in parts])
+        height = np.concatenate([part.height for part in parts])
+        return cls(first, prepared, before, height, parts[0].length)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FloatArray = npt.NDArray[np.float32]
+Which = slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]  # of some pulses
 
 BLOCK = 512  # pulses at a time, to bound memory
 
@@ -109,9 +110,7 @@ class Pulses:
         """Samples per pulse."""
         return int(self.waveforms.shape[1])
 
-    def __getitem__(
-        self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
-    ) -> Pulses:
+    def __getitem__(self, which: Which) -> Pulses:
         """The pulses selected by a slice, a mask or row numbers."""
         chosen = {name: getattr(self, name)[which] for name in _PER_PULSE}
         return Pulses(dt_ns=self.dt_ns, **chosen)

@@ -35,7 +35,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses import _kernels
 from cpunet.pulses._kernels import Rejection as Rejection
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import Pulses, Which
 from cpunet.recipes.schema import CutConfig, PreparationConfig
 from cpunet.settings import Config
 
@@ -104,9 +104,7 @@ class Prepared:
         """Number of rejected pulses by reason, for the reasons that occurred."""
         return rejections_of(self.codes)
 
-    def __getitem__(
-        self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
-    ) -> Prepared:
+    def __getitem__(self, which: Which) -> Prepared:
         """The pulses selected by a slice, a mask or row numbers.
 
         Pulses left out this way are not rejected: `codes` and the counts still describe

@@ -166,10 +166,10 @@ def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
 
 def waveform_tables(file: h5py.File) -> list[str]:
     """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
-    tables = set[str]()
-    for path, _, waveforms, broken in _folders(file):
-        tables.update(broken or ([path] if waveforms else []))
-    return sorted(tables)
+    folders = [
+        (broken, [path] if waveforms else []) for path, _, waveforms, broken in _folders(file)
+    ]
+    return sorted({path for broken, table in folders for path in broken or table})
 
 
 def channel_tables(path: Path, file: h5py.File) -> list[str]:
