@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import h5py
 import hdf5plugin  # noqa: F401 - provides the compression filters of LEGEND's files
@@ -13,8 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-
-Read: TypeAlias = Callable[[int, int], npt.NDArray[Any]]  # rows from one to before another
 
 
 @contextmanager
@@ -134,13 +132,3 @@ def is_column(item: object) -> bool:
     if not isinstance(item, h5py.Dataset) or item.shape is None:  # with a type, without values
         return False
     return item.ndim <= 1 and item.dtype.kind in "iufb"
-
-
-def reading(path: Path, item: h5py.Group | h5py.Dataset, read: Read) -> Read:
-    """A function that reads rows of an item, whose file stays open; see `one_line`."""
-
-    def rows(start: int, stop: int, _open: h5py.File = item.file) -> npt.NDArray[Any]:
-        with one_line(path):
-            return read(start, stop)
-
-    return rows

@@ -12,7 +12,6 @@ import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
 from cpunet.pulses import provenance
-from cpunet.pulses.doubts import rolled_over
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_sizes
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
@@ -263,7 +262,8 @@ def _pulses(file: PulseFile, recipe: Recipe, quality: bool) -> Lines:
             lines += provenance.trace_properties(first, recipe.preparation)
         except CpunetError as error:
             lines.append(("", f"cannot be described: {error}"))
-        lines.append(("odd", str(rolled_over(first.waveforms) or "")))
+        rolled = provenance.rolled_over(first.waveforms)
+        lines.append(("odd", "" if rolled is None else rolled.text))
         if not quality:
             return [*lines, ("", "what cuts leave out, and pile-up tails: `quality`")]
         from cpunet.electronics.pile_up_tails import PileUpTails

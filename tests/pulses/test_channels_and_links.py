@@ -12,6 +12,7 @@ from lh5.compression import ULEB128ZigZagDiff
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.channels import channels_of
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile, table_sizes
 from cpunet.pulses.writing import other_columns
@@ -50,10 +51,9 @@ def test_rows_of_one_channel_are_chosen(tmp_path, columns, chosen, rows):
         pulses = source.read()
         np.testing.assert_array_equal(pulses.waveforms, RAW[rows])
         np.testing.assert_array_equal(pulses.energy_kev, KEV[rows])
-    for size in (2, N):
-        blocks = list(source.blocks(size))
-        np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), RAW[rows])
-        np.testing.assert_array_equal(np.concatenate([b.energy_kev for b in blocks]), KEV[rows])
+    in_twos = Pulses.concatenate(list(source.blocks(2)))
+    np.testing.assert_array_equal(in_twos.waveforms, RAW[rows])
+    np.testing.assert_array_equal(in_twos.energy_kev, KEV[rows])
     read, left_out = other_columns(source, ["waveform", "energy"])
     assert not left_out
     np.testing.assert_array_equal(read(1, 2)["baseline"].nda, np.flatnonzero(rows)[1:3])
@@ -69,9 +69,9 @@ def test_other_columns_of_few_values_do_not_part_rows(tmp_path, name):
 
 
 def test_channels_that_are_text_and_arrays_of_numpy(tmp_path):
-    names = np.array(["V01", "V02"])[PAIRS]
+    names = np.array([b"V01", b"V02"])[PAIRS]
     with h5py.File(tmp_path / "raw.h5", "w") as file:
-        file["waveform"], file["dt_ns"], file["detector"] = RAW, 16.0, names.astype("S")
+        file["waveform"], file["dt_ns"], file["detector"] = RAW, 16.0, names
     assert [*table_sizes(tmp_path / "raw.h5")] == ["detector=V01", "detector=V02"]
     assert open_pulses(tmp_path / "raw.h5", table="detector=V02").n_pulses == N // 2
     np.savez(tmp_path / "raw.npz", waveform=RAW, dt_ns=16.0, ch=HALF)
@@ -85,10 +85,8 @@ def test_compressed_traces_of_one_channel(tmp_path):
     values["values"].attrs["compression"] = ULEB128ZigZagDiff()
     path = write_table(tmp_path / "raw.lh5", "raw", values, channel=HALF)
     for table, rows in (("raw/channel=*", slice(None)), ("channel=3", HALF == 3)):
-        found = open_pulses(path, table=table)
-        assert found.length == LENGTH
-        found = np.concatenate([block.waveforms for block in found.blocks(5)])
-        np.testing.assert_array_equal(found, RAW[rows])
+        found = Pulses.concatenate(list(open_pulses(path, table=table).blocks(5)))
+        np.testing.assert_array_equal(found.waveforms, RAW[rows])
 
 
 @pytest.mark.parametrize("whole", [True, False])

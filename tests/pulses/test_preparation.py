@@ -26,22 +26,13 @@ Array = npt.NDArray[np.float64]
 
 
 def measured(
-    *,
-    n: int = 1,
-    length: int = 1200,
-    start: float = 560.0,
-    amplitude: float = 20_000.0,
-    rise: float = 25.0,
-    tau_us: float = 60.0,
-    noise: float = 8.0,
-    offset: float = 14_000.0,
-    seed: int = 0,
+    *, n=1, length=1200, start=560.0, amplitude=2e4, rise=25.0, tau_us=60.0, noise=8.0, seed=0
 ) -> Array:
     """Traces of a smooth charge pulse behind a resistive-feedback preamplifier."""
     rng = np.random.default_rng(seed)
     t = np.maximum(np.arange(length) - start, 0)
     pulse = (1 - np.exp(-((t / rise) ** 2))) * np.exp(-t * DT_NS / (1e3 * tau_us))
-    return np.asarray(np.rint(offset + amplitude * pulse + rng.normal(0, noise, (n, length))))
+    return np.asarray(np.rint(14_000 + amplitude * pulse + rng.normal(0, noise, (n, length))))
 
 
 def simulated(*, n: int = 1, length: int = 225, seed: int = 0) -> Array:
@@ -75,11 +66,9 @@ class TestMeasured:
     def test_follows_the_definition(self) -> None:
         raw = measured(n=50)
         prepared = prepared_of(raw, align_at=0.999)
-        assert len(prepared) == 50
-        for i, trace in enumerate(raw):
-            window, align = by_definition(trace)
-            assert prepared.align_sample[i] == align
-            np.testing.assert_allclose(prepared.pulses.waveforms[i], window, atol=1e-6)
+        windows, aligns = zip(*map(by_definition, raw), strict=True)
+        np.testing.assert_array_equal(prepared.align_sample, aligns)
+        np.testing.assert_allclose(prepared.pulses.waveforms, windows, atol=1e-6)
 
     def test_noise_tail_and_chi_square_are_those_put_in(self) -> None:
         prepared = prepared_of(measured(n=400, noise=10.0, tau_us=54.6))
@@ -104,9 +93,8 @@ class TestMeasured:
 
     def test_early_pulse_is_padded_with_zero(self) -> None:
         prepared = prepared_of(measured(start=260.0, length=800))
-        padding = 400 - int(prepared.align_sample[0])
+        padding, window = 400 - int(prepared.align_sample[0]), prepared.pulses.waveforms[0]
         assert 0 < padding < 200
-        window = prepared.pulses.waveforms[0]
         assert np.all(window[:padding] == 0)
         assert np.all(window[padding : padding + 5] != 0)
         assert abs(window[padding:200].mean()) < 1e-6
@@ -114,16 +102,15 @@ class TestMeasured:
     def test_what_is_not_a_pulse_is_counted_by_reason(self) -> None:
         good = measured()[0]
         noise = np.random.default_rng(1).normal(14_000, 10, 1200).round()
-        broken = good.copy()
-        broken[30] = np.nan
-        endless = good.copy()
-        endless[700] = np.inf
-        undershoot = good.copy()
-        undershoot[650:] = 13_000
-        traces = [good, broken, endless, np.full(1200, 5.0), noise, 30_000 - good, undershoot]
-        no_logarithm = good.copy()
-        no_logarithm[900] = 10_000
-        prepared = prepared_of(np.array([*traces, no_logarithm]))
+
+        def spoiled(where: int | slice, value: float) -> Array:
+            trace = good.copy()
+            trace[where] = value
+            return trace
+
+        traces = [good, spoiled(30, np.nan), spoiled(700, np.inf), np.full(1200, 5.0), noise]
+        traces += [30_000 - good, spoiled(slice(650, None), 13_000), spoiled(900, 10_000)]
+        prepared = prepared_of(np.array(traces))
         labels = [Rejection(c).label for c in prepared.codes]
         reasons = ["accepted", "nan", "nan", "constant"] + 3 * ["no_amplitude"]
         assert labels == [*reasons, "tail_not_positive"]
@@ -162,7 +149,6 @@ class TestSimulated:
     def test_scaled_to_one_aligned_and_padded(self) -> None:
         raw = 3 + 2 * simulated(n=20)
         prepared = prepared_of(raw, "simulated", align_at=0.999)
-        assert len(prepared) == 20
         windows = prepared.pulses.waveforms
         assert np.all(windows.min(1) == 0)
         np.testing.assert_allclose(windows.max(1), 1, rtol=1e-6)
@@ -171,17 +157,15 @@ class TestSimulated:
         for window, align, trace in zip(windows, prepared.align_sample, raw, strict=True):
             assert np.all(window[: 400 - align] == 0)
             inside = (trace - trace.min()) / np.ptp(trace)
-            np.testing.assert_allclose(
-                window[400 - align : 625 - align][: 400 + align], inside, atol=1e-6
-            )
+            record = window[400 - align : 625 - align][: 400 + align]
+            np.testing.assert_allclose(record, inside, atol=1e-6)
             assert np.all(window[625 - align :] == window[-1])
 
     def test_charge_of_the_first_sample_is_no_baseline(self) -> None:
         """A pulse that moves from the first sample on has moved by then; an offset has not."""
         drift = np.clip((np.arange(225) + 0.5) / 20, 0, 1)[np.newaxis]
         prepared = prepared_of(drift, "simulated")
-        start = 400 - prepared.align_sample[0]
-        window = prepared.pulses.waveforms[0]
+        start, window = 400 - prepared.align_sample[0], prepared.pulses.waveforms[0]
         assert prepared.baseline[0] == 0.0
         np.testing.assert_allclose(window[start : start + 225], drift[0], atol=1e-7)
         assert not window[:start].any()
@@ -225,9 +209,8 @@ SHORT = CONFIG.model_copy(update=SIZES)
 def file_of(energies: npt.ArrayLike, broken: list[int] | None = None) -> PulseFile:
     energy_kev = np.asarray(energies, float)
     t = np.maximum(np.arange(60) - 27, 0)
-    raw = (
-        np.nan_to_num(energy_kev, nan=500.0)[:, None] * np.minimum(t / 5, 1) * np.exp(-t / 300)
-    )
+    raw = np.nan_to_num(energy_kev, nan=500.0)[:, None] * np.minimum(t / 5, 1)
+    raw *= np.exp(-t / 300)
     raw *= 1 + 1e-6 * np.arange(len(raw))[:, None]  # else they are copies
     raw[broken or []] = np.nan
     pulses = Pulses.of(raw, dt_ns=16, energy_kev=energy_kev)
@@ -275,10 +258,7 @@ def test_rows_written_twice_count_once(kind, same_events) -> None:
 
 
 @settings(max_examples=50, deadline=None)
-@given(
-    st.lists(st.sampled_from([1000.0, 50.0, np.nan]), min_size=1, max_size=20),
-    st.integers(1, 20),
-)
+@given(st.lists(st.sampled_from([1000.0, 50.0, np.nan]), min_size=1), st.integers(1, 20))
 def test_counts_add_up(energies: list[float], max_pulses: int) -> None:
     file = file_of([*energies, 1000.0])
     prepared = load(file, max_pulses=max_pulses)
@@ -308,15 +288,9 @@ def test_of_too_many_a_sample_of_the_whole_file_is_kept() -> None:
     [
         ([], [], ["run7.lh5", "no pulses"]),
         ([50.0] * 9, [], ["9 energy_outside_selection", "calibration"]),
-        (
-            [1000.0] * 5 + [50.0],
-            [0, 1, 2, 3, 4],
-            ["5 nan, 1 energy_outside", "write them again"],
-        ),
+        ([1000.0] * 5 + [50.0], [*range(5)], ["5 nan, 1 energy_outside", "write them again"]),
         ([np.nan] * 3, [], ["3 energy_unknown", "calibrated energies"]),
     ],
 )
-def test_nothing_left_is_one_line_with_counts_and_remedy(
-    energies: list[float], broken: list[int], words: list[str]
-) -> None:
+def test_nothing_left_is_one_line_with_counts_and_remedy(energies, broken, words) -> None:
     one_line(lambda: load(file_of(energies, broken)), *words)

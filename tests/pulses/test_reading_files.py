@@ -27,41 +27,39 @@ def write_npz(path: Path, **arrays) -> Path:
 
 def write_hdf5(path: Path, **arrays) -> Path:
     with h5py.File(path, "w") as h5:
-        for name, values in arrays.items():
-            h5[name] = values
+        h5.update(arrays)
     return path
 
 
-WRITERS = [(write_npz, "pulses.npz"), (write_hdf5, "pulses.h5")]
+formats = pytest.mark.parametrize(
+    ("write", "name"), [(write_npz, "pulses.npz"), (write_hdf5, "pulses.h5")]
+)
 
 
-@pytest.mark.parametrize(("write", "name"), WRITERS)
+@formats
 @pytest.mark.parametrize("waveform", ["waveform", "waveforms", "values"])
 @pytest.mark.parametrize("dt_ns", [16.0, [16.0], np.full(11, 16.0)])
 @pytest.mark.parametrize("energy", ["energy_kev", "energy_keV"])
 def test_the_usual_names_are_understood(tmp_path, write, name, waveform, dt_ns, energy):
-    arrays = {
-        waveform: VALUES,
-        "dt_ns": dt_ns,
-        energy: ENERGY,
-        "event_number": np.arange(11) * 3,
-    }
+    numbers = np.arange(11) * 3
+    arrays = {waveform: VALUES, "dt_ns": dt_ns, energy: ENERGY, "event_number": numbers}
     source = open_pulses(write(tmp_path / name, **arrays))
     assert (source.n_pulses, source.length, source.dt_ns) == (11, 30, 16.0)
     blocks = list(source.blocks(4))
     assert [len(block) for block in blocks] == [4, 4, 3]
-    np.testing.assert_array_equal(np.concatenate([b.waveforms for b in blocks]), VALUES)
-    np.testing.assert_array_equal(np.concatenate([b.energy_kev for b in blocks]), ENERGY)
-    assert source.read().event_number.tolist() == list(range(0, 33, 3))
+    pulses = Pulses.concatenate(blocks)
+    np.testing.assert_array_equal(pulses.waveforms, VALUES)
+    np.testing.assert_array_equal(pulses.energy_kev, ENERGY)
+    np.testing.assert_array_equal(pulses.event_number, numbers)
 
 
 def test_a_choice_between_arrays(tmp_path):
     path = write_npz(tmp_path / "pulses.npz", wf1=VALUES, wf16=VALUES[:, ::2], note="text")
-    with pytest.raises(CpunetError, match=r"2 arrays of two dimensions \(wf1, wf16\); choose"):
-        open_pulses(path, dt_ns=16)
     assert open_pulses(path, table="wf16", dt_ns=16).length == 15
-    with pytest.raises(CpunetError, match="no array wf2; there are wf1, wf16"):
-        open_pulses(path, table="wf2", dt_ns=16)
+    several = r"2 arrays of two dimensions \(wf1, wf16\); choose"
+    for table, said in ((None, several), ("wf2", "no array wf2; there are wf1, wf16")):
+        with pytest.raises(CpunetError, match=said):
+            open_pulses(path, table=table, dt_ns=16)
 
 
 def test_npy_needs_the_period(tmp_path):
@@ -75,23 +73,23 @@ def test_npy_needs_the_period(tmp_path):
             open_pulses(path, dt_ns=dt_ns)
 
 
+@formats
 @pytest.mark.parametrize("orient", [np.ravel, np.atleast_2d, np.vstack])
-@pytest.mark.parametrize("suffix", ["npz", "h5"])
 @pytest.mark.parametrize("n", [1, 7])
-def test_columns_of_a_format_without_vectors(tmp_path, suffix, orient, n):
+def test_columns_of_a_format_without_vectors(tmp_path, write, name, orient, n):
     """MATLAB writes a row or a column: https://github.com/scipy/scipy/issues/13093."""
-    path, values = tmp_path / f"file.{suffix}", np.random.default_rng(1).normal(size=(n, 40))
-    energies = 1000.0 + np.arange(n)
-    arrays = {"waveform": values, "dt_ns": np.full((1, 1), 8.0), "energy_kev": orient(energies)}
-    if suffix == "npz":
-        np.savez(path, **arrays)
-    else:
-        with h5py.File(path, "w") as file:
-            file.update(arrays)
-    pulses = open_pulses(path).read()
-    np.testing.assert_array_equal(pulses.waveforms, values.astype(np.float32))
-    np.testing.assert_array_equal(pulses.energy_kev, energies)
+    arrays = {"waveform": VALUES[:n], "dt_ns": [[8.0]], "energy_kev": orient(ENERGY[:n])}
+    pulses = open_pulses(write(tmp_path / name, **arrays)).read()
+    np.testing.assert_array_equal(pulses.waveforms, VALUES[:n])
+    np.testing.assert_array_equal(pulses.energy_kev, ENERGY[:n])
     assert pulses.dt_ns == 8
+
+
+@formats
+def test_reversed_dimensions_are_named(tmp_path, write, name):
+    path = write(tmp_path / name, waveform=VALUES.T, energy_kev=ENERGY)
+    with pytest.raises(CpunetError, match=rf"{name}: .*\(30, 11\) .* reversed; .* transposed"):
+        open_pulses(path, dt_ns=16)
 
 
 def test_datasets_and_attributes_without_values(tmp_path):
@@ -155,8 +153,7 @@ def whole(tmp_path_factory) -> list[Path]:
     """A file of each format."""
     folder = tmp_path_factory.mktemp("whole")
     values = np.random.default_rng(3).normal(size=(30, 40)).astype("<f4")
-    pulses = Pulses.of(values, dt_ns=16, energy_kev=np.arange(30.0))
-    write_pulses(folder / "a.lh5", pulses)
+    write_pulses(folder / "a.lh5", Pulses.of(values, dt_ns=16, energy_kev=np.arange(30.0)))
     np.savez(folder / "b.npz", waveform=values, energy_kev=np.arange(30.0))
     np.savez_compressed(folder / "c.npz", waveform=values)
     np.save(folder / "d.npy", values)
@@ -175,14 +172,11 @@ def test_any_truncation_is_one_line_naming_the_file(whole, fraction, which):
     assert str(error.value).startswith(f"{path}: ")
 
 
-@pytest.mark.parametrize(
-    "values",
-    [np.zeros(5), np.zeros((5, 4, 4)), np.full((5, 9), b"a")],
-    ids=["1d", "3d", "text"],
-)
-def test_lh5_values_that_are_no_traces(tmp_path, values):
+@pytest.mark.parametrize("shape", [5, (5, 4, 4), None])
+def test_lh5_values_that_are_no_traces(tmp_path, shape):
     path = tmp_path / "file.lh5"
     write_pulses(path, Pulses.of(np.zeros((5, 20)), dt_ns=16))
+    values = np.full((5, 9), b"a") if shape is None else np.zeros(shape)
     with h5py.File(path, "r+") as file:
         old = "geds/sim/waveform/values"
         attributes = dict(file[old].attrs)

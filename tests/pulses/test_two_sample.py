@@ -22,10 +22,8 @@ def windows(rng, n, mean=0.0, spread=1.0, noise=0.01):
 
 def edges(rng, n, width=4.0, noise=0.004):
     """Edges with a random amount of drift before them."""
-    drift = rng.uniform(5, 25, (n, 1))
-    share = rng.uniform(0.2, 1, (n, 1))
-    late = ndtr((TIME - 45) / width)
-    early = ndtr((TIME - 45 + drift) / width)
+    drift, share = rng.uniform(5, 25, (n, 1)), rng.uniform(0.2, 1, (n, 1))
+    late, early = ndtr((TIME - 45) / width), ndtr((TIME - 45 + drift) / width)
     pulses = share * late + (1 - share) * early
     return np.float32(pulses + noise * rng.normal(size=pulses.shape))
 
@@ -37,17 +35,15 @@ def significance(result):
 def test_equal_distributions_cannot_be_told_apart():
     """Over many draws the AUC is 0.5 within its errors, and so is the null."""
     rng = np.random.default_rng(0)
-    results = [
-        classifier_auc(edges(rng, 120), edges(rng, 120), seed=draw) for draw in range(30)
-    ]
+    sides = [(edges(rng, 120), edges(rng, 120)) for _ in range(30)]
+    results = [classifier_auc(*pair, seed=draw) for draw, pair in enumerate(sides)]
     aucs = np.array([r.auc for r in results])
     assert aucs.mean() == pytest.approx(0.5, abs=0.015)
     assert np.mean([r.null_mean for r in results]) == pytest.approx(0.5, abs=0.01)
     null_std = np.mean([r.null_std for r in results])
     assert aucs.std() == pytest.approx(null_std, rel=0.3)
     assert np.mean([abs(significance(r)) < 2 for r in results]) > 0.85
-    within = [abs(r.auc - 0.5) < 2 * r.auc_std for r in results]
-    assert np.mean(within) > 0.85
+    assert np.mean([abs(r.auc - 0.5) < 2 * r.auc_std for r in results]) > 0.85
 
 
 @pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
@@ -68,10 +64,7 @@ def test_additional_features_are_used():
     rng = np.random.default_rng(6)
     sides = edges(rng, 400), edges(rng, 400)
     blind = classifier_auc(*sides, seed=0)
-    values = (
-        {"drift_time": rng.normal(1000, 50, 400)},
-        {"drift_time": rng.normal(1100, 50, 400)},
-    )
+    values = tuple({"drift_time": rng.normal(mean, 50, 400)} for mean in (1000, 1100))
     seeing = classifier_auc(*sides, seed=0, features=values)
     assert abs(significance(blind)) < 3
     assert seeing.auc > 0.85  # 0.92 with nothing else to look at
@@ -82,12 +75,9 @@ def test_rows_that_are_not_finite_are_left_out_and_counted():
     data, others = edges(rng, 120), edges(rng, 110)
     data[3, 5] = np.nan
     others[:2] = np.inf
-    slopes = rng.normal(size=120), rng.normal(size=110)
-    slopes[0][10:14] = np.nan
-    slopes[0][3] = np.nan  # this row is left out already
-    result = classifier_auc(
-        data, others, seed=0, features=({"tail_slope": slopes[0]}, {"tail_slope": slopes[1]})
-    )
+    slopes = [{"tail_slope": rng.normal(size=n)} for n in (120, 110)]
+    slopes[0]["tail_slope"][[3, 10, 11, 12, 13]] = np.nan  # row 3 is left out already
+    result = classifier_auc(data, others, seed=0, features=slopes)
     assert (result.missing_data, result.missing_sim) == (5, 2)
     assert result.n_data == result.n_sim == 108  # the smaller side
     assert 0.3 < result.auc < 0.7
@@ -106,19 +96,21 @@ def test_unequal_sides_and_the_cap(monkeypatch):
 
 def test_rounding_is_no_difference():
     rng = np.random.default_rng(11)
-    data, others = (windows(rng, 200, noise=0.0) for _ in range(2))
-    assert abs(significance(classifier_auc(data, others, seed=0))) < 3
+    sides = (windows(rng, 200, noise=0.0) for _ in range(2))
+    assert abs(significance(classifier_auc(*sides, seed=0))) < 3
 
 
 def test_too_few_pulses_are_named():
     rng = np.random.default_rng(13)
-    few = windows(rng, 41)
+    few, enough = windows(rng, 41), windows(rng, 60)
     few[:2] = np.nan
-    with pytest.raises(CpunetError, match="39 measured and 60 simulated"):
-        classifier_auc(few, windows(rng, 60), seed=0)
-    with pytest.raises(CpunetError, match="0 simulated"):
-        classifier_auc(windows(rng, 60), np.empty((0, len(TIME)), np.float32), seed=0)
-    assert classifier_auc(windows(rng, 40), windows(rng, 40), seed=0).n_sim == 40
+    for sides, said in (
+        ((few, enough), "39 measured and 60 sim"),
+        ((enough, few[:0]), "0 sim"),
+    ):
+        with pytest.raises(CpunetError, match=said):
+            classifier_auc(*sides, seed=0)
+    assert classifier_auc(enough[:40], enough[20:], seed=0).n_sim == 40
 
 
 def test_auc_is_the_fraction_of_ordered_pairs():
@@ -127,16 +119,13 @@ def test_auc_is_the_fraction_of_ordered_pairs():
     difference = positives[:, np.newaxis] - negatives
     expected = (difference > 0).mean() + 0.5 * (difference == 0).mean()
     assert auc_and_variance(negatives, positives)[0] == pytest.approx(expected)
-    swapped = auc_and_variance(positives, negatives)[0]
-    assert swapped == pytest.approx(1 - expected)
+    assert auc_and_variance(positives, negatives)[0] == pytest.approx(1 - expected)
 
 
 @pytest.mark.parametrize("shift", [0.0, 1.0, 2.5])
 def test_variance_is_the_spread_over_repeated_samples(shift):
     rng = np.random.default_rng(16)
-    # each column is a sample
-    aucs, variances = auc_and_variance(
-        rng.normal(size=(60, 1500)), rng.normal(shift, 1.5, (90, 1500))
-    )
+    columns = rng.normal(size=(60, 1500)), rng.normal(shift, 1.5, (90, 1500))  # samples
+    aucs, variances = auc_and_variance(*columns)
     assert aucs.mean() == pytest.approx(ndtr(shift / np.hypot(1, 1.5)), abs=0.005)
     assert aucs.var() == pytest.approx(variances.mean(), rel=0.12)

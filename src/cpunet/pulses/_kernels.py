@@ -130,7 +130,10 @@ class Rejection(IntEnum):
         return self.name.lower()
 
 
-COLUMNS = 7  # numbers of a pulse, see `_prepare_one`
+# Numbers of a pulse; slopes are per sample.
+NUMBERS = (
+    "baseline", "scale", "align_sample", "baseline_rms", "baseline_slope", "tail_slope", "chi2",
+)  # fmt: skip
 
 # The alignment moves the window of the baseline, and this the level at which it is searched.
 # Two rounds settle all but exact ties.
@@ -221,18 +224,12 @@ def _aligned(trace, top, top_sample, s):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _smooth(trace, half, smooth):  # type: ignore[no-untyped-def]
+def _smoothed(trace, half):  # type: ignore[no-untyped-def]
     """Means over the samples up to `half` away; fewer at the ends of the trace."""
-    length = len(trace)
-    total, first, stop = 0.0, 0, 0
-    for i in range(length):
-        while stop < min(i + half + 1, length):
-            total += trace[stop]
-            stop += 1
-        while first < i - half:
-            total -= trace[first]
-            first += 1
-        smooth[i] = total / (stop - first)
+    length, samples = len(trace), np.arange(len(trace))
+    sums = np.append(np.zeros(1), np.cumsum(trace.astype(np.float64)))
+    first, stop = np.maximum(samples - half, 0), np.minimum(samples + half + 1, length)
+    return (sums[stop] - sums[first]) / (stop - first)
 
 
 @compiled
@@ -245,10 +242,10 @@ def _half_crossing(trace, smooth, align, s):  # type: ignore[no-untyped-def]
     several crossings by noise is meant.
     """
     start, stop, n = align - s.samples_before, align + s.samples_after, s.decay_fit_samples
-    base, centre, last = _base_of_window(trace, start, stop, s), 0.5 * (n - 1), len(trace) - 1
+    base, last = _base_of_window(trace, start, stop, s), len(trace) - 1
     tail = trace[np.minimum(np.arange(stop - n, stop), last)].astype(np.float64)
-    slope = ((np.arange(n) - centre) * tail).sum() / (n * (n * n - 1.0) / 12.0)
-    height = tail.sum() / n + slope * (align - (stop - n + centre)) - base
+    mean, slope, _ = line(tail)
+    height = mean + slope * (align - (stop - 0.5 * (n + 1))) - base
 
     level = base + 0.5 * height
     near = min(crossing(smooth, min(stop - n, last), level) + s.smoothed, last)
@@ -267,7 +264,6 @@ def _half_crossing(trace, smooth, align, s):  # type: ignore[no-untyped-def]
 def _aligned_half(trace, smooth, s):  # type: ignore[no-untyped-def]
     """The sample nearest to the crossing of half the height, base, height and rise."""
     length = len(trace)
-    _smooth(trace, s.smoothed, smooth)
     if length == s.samples_before + s.samples_after:  # prepared already?
         align = s.samples_before
         time, base, height, rise = _half_crossing(trace, smooth, align, s)
@@ -318,12 +314,8 @@ def _quiet(trace, start, mean, align, top, s):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _prepare_one(trace, s, window, numbers, smooth):  # type: ignore[no-untyped-def]
-    """Fill a window and numbers from a trace and return its code.
-
-    The numbers are baseline, scale, aligned sample, RMS and slope of the baseline over the
-    scale, slope of the logarithm of the tail, and its chi-square; slopes are per sample.
-    """
+def _prepare_one(trace, s, window, numbers):  # type: ignore[no-untyped-def]
+    """Fill a window and its `NUMBERS` from a trace and return its code."""
     if not np.isfinite(trace).all():
         return Rejection.NAN
     length, top = len(trace), np.float64(trace.max())
@@ -334,6 +326,7 @@ def _prepare_one(trace, s, window, numbers, smooth):  # type: ignore[no-untyped-
     if not s.simulated and is_saturated(trace, quiet, top, top_sample, s.saturation_run):
         return Rejection.SATURATED
 
+    smooth = _smoothed(trace, s.smoothed)
     if s.of_maximum == 0:
         align, base, height, rise = _aligned_half(trace, smooth, s)
         top = np.float64(trace[: align + s.samples_after].max())
@@ -377,16 +370,15 @@ def _prepare_one(trace, s, window, numbers, smooth):  # type: ignore[no-untyped-
     tail_slope, chi2 = tail_fit(window[-s.decay_fit_samples :], noise)
     if math.isnan(tail_slope):
         return Rejection.TAIL_NOT_POSITIVE
-    numbers[0], numbers[1], numbers[2], numbers[3] = base, scale, align, noise
-    numbers[4], numbers[5], numbers[6] = slope / scale, tail_slope, chi2
+    numbers[:] = np.array([base, scale, align, noise, slope / scale, tail_slope, chi2])
     return Rejection.ACCEPTED
 
 
 @compiled
 def prepare_block(waveforms, s, windows, numbers, codes):  # type: ignore[no-untyped-def]
     """Prepare all traces; accepted ones fill the first rows.  Return their number."""
-    smooth, n = np.empty(waveforms.shape[1]), 0
+    n = 0
     for i in range(len(waveforms)):
-        codes[i] = _prepare_one(waveforms[i], s, windows[n], numbers[n], smooth)
+        codes[i] = _prepare_one(waveforms[i], s, windows[n], numbers[n])
         n += codes[i] == Rejection.ACCEPTED
     return n

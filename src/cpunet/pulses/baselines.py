@@ -94,24 +94,16 @@ class Baselines:
         else:
             shares = np.quantile(before if len(before) else [0], (SHORTEST_SHARE, STORED_SHARE))
             length, stored = (max(int(samples), 0) for samples in shares)
-        return cls(
-            first=raw.with_waveforms(raw.waveforms[:, :stored].copy()),
-            prepared=replace(
-                prepared, pulses=prepared.pulses.with_waveforms(windows[:, :0].copy())
-            ),
-            before=before,
-            height=windows.max(axis=1) * prepared.scale,
-            length=length,
-        )
+        first = raw.with_waveforms(raw.waveforms[:, :stored].copy())
+        no_windows = prepared.pulses.with_waveforms(windows[:, :0].copy())
+        height = windows.max(axis=1) * prepared.scale
+        return cls(first, replace(prepared, pulses=no_windows), before, height, length)
 
     @classmethod
-    def concatenate(cls, parts: Sequence[Baselines], whole: Pulses | None = None) -> Self:
+    def concatenate(cls, parts: Sequence[Baselines]) -> Self:
         """Baselines of consecutive blocks."""
-        return cls(
-            first=Pulses.concatenate([part.first for part in parts]),
-            prepared=Prepared.concatenate([part.prepared for part in parts]),
-            before=np.concatenate([part.before for part in parts]),
-            height=np.concatenate([part.height for part in parts]),
-            length=parts[0].length,
-            whole=whole,
-        )
+        first = Pulses.concatenate([part.first for part in parts])
+        prepared = Prepared.concatenate([part.prepared for part in parts])
+        before = np.concatenate([part.before for part in parts])
+        height = np.concatenate([part.height for part in parts])
+        return cls(first, prepared, before, height, parts[0].length)

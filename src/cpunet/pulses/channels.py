@@ -17,6 +17,7 @@ from cpunet.outputs import MARKER
 from cpunet.processes import outcomes, usable_cores
 from cpunet.progress import stage
 from cpunet.pulses.reading.files import ALL, PulseFile, table_sizes
+from cpunet.tables import aligned
 
 log = logging.getLogger(__name__)
 
@@ -24,6 +25,7 @@ CHANNEL = "{channel}"  # in the name of an energy column
 
 R = TypeVar("R")
 Pair = tuple[PulseFile, PulseFile]
+Pairs = Mapping[str, Pair | CpunetError]  # of each channel, or why it has none
 
 
 def channel_names(tables: list[str]) -> dict[str, str]:
@@ -93,13 +95,11 @@ def paired(sim: PulseFile, data: PulseFile) -> dict[str, Pair | CpunetError]:
         simulated = {name: replace(sim, path=path) for name, path in paths.items()}
     else:
         simulated = channels_of(sim) if sim.table == ALL else dict.fromkeys(measured, sim)
-    names = ", ".join(simulated)
-    return {
-        name: (simulated[name], file)
-        if name in simulated
-        else CpunetError(f"{sim.path}: no table of {name}; there are those of {names}")
-        for name, file in measured.items()
-    }
+    pairs: dict[str, Pair | CpunetError] = {}
+    for name, file in measured.items():
+        others = f"{sim.path}: no table of {name}; there are those of {', '.join(simulated)}"
+        pairs[name] = (simulated[name], file) if name in simulated else CpunetError(others)
+    return pairs
 
 
 @dataclass(frozen=True)
@@ -119,13 +119,10 @@ class Outcome(Generic[R]):
     def __str__(self) -> str:
         lines = {name: repr(result).strip("<>'") for name, result in self.done.items()}
         lines |= {name: f"failed: {reason}" for name, reason in self.failed.items()}
-        width = max(map(len, lines), default=0)
-        return "\n".join(f"{name:<{width}}  {line}" for name, line in lines.items())
+        return aligned([*lines.items()])
 
 
-def each_channel(
-    channels: Mapping[str, Pair | CpunetError], out: Path, do: Callable[[str, Pair, Path], R]
-) -> Outcome[R]:
+def each_channel(channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R]) -> Outcome[R]:
     """Process each channel, on all cores; a failed channel does not stop the others.
 
     Parameters
@@ -148,7 +145,7 @@ def each_channel(
             f"{out}: is the output of one channel; choose another `out` for the folders of "
             f"{len(channels)}"
         )
-    arrived: dict[str, R | CpunetError] = {}
+    done, failed = dict[str, R](), dict[str, str]()
     make = partial(partial, _one_channel, dict(channels), out, do)  # called in each process
     with (
         stage("Channels", len(channels)) as bar,
@@ -156,21 +153,19 @@ def each_channel(
     ):
         for name, outcome in results:
             bar.update()
-            arrived[name] = outcome
             if isinstance(outcome, CpunetError):
+                failed[name] = str(outcome)
                 log.info(f"{name}: failed: {outcome}")
-    in_order = [(name, arrived[name]) for name in channels]
+            else:
+                done[name] = outcome
     return Outcome(
-        {name: result for name, result in in_order if not isinstance(result, CpunetError)},
-        {name: str(error) for name, error in in_order if isinstance(error, CpunetError)},
+        {name: done[name] for name in channels if name in done},
+        {name: failed[name] for name in channels if name in failed},
     )
 
 
 def _one_channel(
-    channels: Mapping[str, Pair | CpunetError],
-    out: Path,
-    do: Callable[[str, Pair, Path], R],
-    name: str,
+    channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R], name: str
 ) -> R:
     pair = channels[name]
     if isinstance(pair, CpunetError):

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FloatArray = npt.NDArray[np.float32]
+Which = slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]  # of some pulses
 
 BLOCK = 512  # pulses at a time, to bound memory
 
@@ -95,15 +96,11 @@ class Pulses:
         values = _numbers(waveforms, np.float32, "waveforms")
         n = len(values)
         kev = np.full(n, np.nan) if energy_kev is None else energy_kev
-        numbers = np.arange(n) if event_number is None else event_number
-        return cls(
-            waveforms=values,
-            dt_ns=float(dt_ns),
-            energy_kev=_numbers(kev, np.float64, "energy_kev"),
-            event_number=np.asarray(numbers, np.int64),
-            peak=np.full(n, "") if peak is None else np.asarray(peak, np.str_),
-            t0_ns=np.broadcast_to(np.asarray(t0_ns, float), (n,)),
-        )
+        numbers = np.asarray(np.arange(n) if event_number is None else event_number, np.int64)
+        peaks = np.full(n, "") if peak is None else np.asarray(peak, np.str_)
+        times = np.broadcast_to(np.asarray(t0_ns, float), (n,))
+        energies = _numbers(kev, np.float64, "energy_kev")
+        return cls(values, float(dt_ns), energies, numbers, peaks, times)
 
     def __len__(self) -> int:
         return len(self.waveforms)
@@ -113,9 +110,7 @@ class Pulses:
         """Samples per pulse."""
         return int(self.waveforms.shape[1])
 
-    def __getitem__(
-        self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
-    ) -> Pulses:
+    def __getitem__(self, which: Which) -> Pulses:
         """The pulses selected by a slice, a mask or row numbers."""
         chosen = {name: getattr(self, name)[which] for name in _PER_PULSE}
         return Pulses(dt_ns=self.dt_ns, **chosen)

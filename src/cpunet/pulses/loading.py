@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
+from cpunet.pulses import provenance
 from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.doubts import LOW_KEV, require_sense, rolled_over
 from cpunet.pulses.peaks import EnergySelection, label_peaks, suggested_calibration
 from cpunet.pulses.preparation import (
     Codes,
@@ -31,9 +31,7 @@ from cpunet.pulses.preparation import (
     apply_cuts,
     fit_cuts,
     prepare,
-    rejections_of,
 )
-from cpunet.pulses.provenance import recorded_detector, require_side
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.reading.source import PulseSource, amplitude
 from cpunet.recipes.schema import MatchingConfig, PreparationConfig, Recipe
@@ -53,26 +51,19 @@ SHORTER_NS, MORE, TRIED = range(320, 3201, 320), 0.01, 1024
 SWAPPED = "are `sim` and `data` swapped?"
 
 
+_OR_PAD = "or allow more preparation.padding_before_ns and padding_after_ns"
 _REMEDIES = {
     Rejection.NAN: "where NaN pads pulses, continue their last value, or write them again",
     Rejection.CONSTANT: "check that these are the waveforms of a channel that was on",
     Rejection.SATURATED: "select lower energies or another channel",
-    Rejection.WINDOW_OUTSIDE_RECORD: (
-        "give longer records, or allow more preparation.padding_before_ns and padding_after_ns"
-    ),
-    Rejection.PULSE_AT_EDGE: (
-        "give records with more before and after the pulse, or allow more "
-        "preparation.padding_before_ns and padding_after_ns"
-    ),
-    Rejection.NO_PLATEAU: (
-        "give a longer preparation.after_ns: the charge is not collected in time"
-    ),
+    Rejection.WINDOW_OUTSIDE_RECORD: f"give longer records, {_OR_PAD}",
+    Rejection.PULSE_AT_EDGE: f"give records with more before and after the pulse, {_OR_PAD}",
+    Rejection.NO_PLATEAU: "give a longer preparation.after_ns: charge is collected later",
     Rejection.SECOND_PULSE: "check the rate: another pulse follows in nearly all traces",
     Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
     Rejection.TAIL_NOT_POSITIVE: "select higher energies",
     Rejection.ENERGY_UNKNOWN: (
-        "name the column of their calibrated energies (`energy`, `data_energy`), or give "
-        "`kev_per_adc`"
+        "name the column of calibrated energies (`energy`, `data_energy`) or give `kev_per_adc`"
     ),
     Rejection.ENERGY_OUTSIDE_SELECTION: "check the calibration and the selected peaks",
 }
@@ -82,12 +73,9 @@ class InfoPart(BaseModel):
     """Further entries stay as they are."""
 
     model_config = ConfigDict(
-        extra="allow",
-        frozen=True,
-        strict=True,
-        allow_inf_nan=False,
+        extra="allow", frozen=True, strict=True, allow_inf_nan=False,
         arbitrary_types_allowed=True,
-    )
+    )  # fmt: skip
 
 
 class SideInfo(InfoPart):
@@ -124,10 +112,8 @@ class SideInfo(InfoPart):
     def reading(self, file: PulseFile) -> PulseFile:
         """A file with the reading options that the training had for it as defaults."""
         own = self.read_as
-        other = any(own.get(name) != value for name, value in file.options.items())
-        if other or self.place != str(file.path.resolve()):
-            return file
-        return replace(file, **own)
+        same = all(own.get(name) == value for name, value in file.options.items())
+        return replace(file, **own) if same and self.place == str(file.path.resolve()) else file
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,18 +141,15 @@ class InputSet:
     def provenance(self) -> SideInfo:
         """File, counts, and a fingerprint of the pulses used."""
         waveforms = np.ascontiguousarray(self.prepared.pulses.waveforms)
+        of_file = ("read_as", "dt_ns", "cuts", "counts", "detector")
         return SideInfo(
             file=str(self.path),
             place=str(self.path.resolve()),
-            read_as=self.read_as,
-            dt_ns=self.dt_ns,
             read=self.prepared.n_read,
             used=len(self.prepared),
             rejections=self.prepared.rejections,
-            cuts=self.cuts,
-            counts=self.counts,
             sha256=hashlib.sha256(waveforms.data).hexdigest(),
-            detector=self.detector,
+            **{name: getattr(self, name) for name in of_file},
         )
 
     def fingerprint(self) -> dict[str, str | float]:
@@ -207,11 +190,10 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     with file.open() as source:
-        require_side(source, side, SWAPPED, insist=file.insist)
-        how = (recipe, selection, max_pulses, shorten)
-        inputs, parts, whole = _read(source, file, side, *how)
+        provenance.require_side(source, side, SWAPPED, insist=file.insist)
+        inputs, whole = _read(source, file, side, recipe, selection, max_pulses, shorten)
     recipe, prepared = inputs.recipe.at(inputs.dt_ns), inputs.prepared
-    if side == "measured":
+    if inputs.baselines is not None:
         cuts = fit_cuts(prepared, recipe.cuts)
         prepared = apply_cuts(prepared, cuts)
         if not len(prepared):
@@ -219,7 +201,7 @@ def load_pulses(
                 f"{file.path}: the quality cuts leave no pulse", "widen cuts.*_sigmas"
             )
         passed = [traces[np.isin(rows, prepared.index)] for rows, traces in whole]
-        baselines = Baselines.concatenate(parts, Pulses.concatenate(passed))
+        baselines = replace(inputs.baselines, whole=Pulses.concatenate(passed))
         inputs = replace(inputs, prepared=prepared, cuts=cuts, baselines=baselines)
     elif tell:
         ends = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
@@ -252,20 +234,19 @@ def _within_traces(block: Pulses, recipe: Recipe, name: str) -> Recipe:
     if np.mean((raw >= half).argmax(axis=1) > raw.shape[1] - needed) <= MORE:
         return recipe
 
-    def outside(recipe: Recipe) -> float:
-        codes = prepare(block, recipe.at(dt_ns).preparation, "measured").codes
-        edge = np.isin(codes, (Rejection.PULSE_AT_EDGE, Rejection.WINDOW_OUTSIDE_RECORD))
-        return float(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
-
-    tried = [recipe]
-    for by in SHORTER_NS:
+    tried, outside = list[Recipe](), list[float]()
+    for by in (0, *SHORTER_NS):
         after, decay = windows.after_ns - by, windows.decay_fit_ns - by
-        if min(after - training.level_ns, decay) > 0:
-            to = {"after_ns": after, "decay_fit_ns": decay}
-            within = training.model_copy(update={"after_ns": min(training.after_ns, after)})
-            changed = {"preparation": windows.model_copy(update=to), "training": within}
-            tried.append(recipe.model_copy(update=changed))
-    shares = np.array([outside(shorter) for shorter in tried])
+        if by and min(after - training.level_ns, decay) <= 0:
+            break
+        to = {"after_ns": after, "decay_fit_ns": decay}
+        within = training.model_copy(update={"after_ns": min(training.after_ns, after)})
+        changed = {"preparation": windows.model_copy(update=to), "training": within}
+        tried.append(recipe.model_copy(update=changed))
+        codes = prepare(block, tried[-1].at(dt_ns).preparation, "measured").codes
+        edge = np.isin(codes, (Rejection.PULSE_AT_EDGE, Rejection.WINDOW_OUTSIDE_RECORD))
+        outside.append(edge.sum() / max((edge | (codes == Rejection.ACCEPTED)).sum(), 1))
+    shares = np.array(outside)
     if shares[0] - shares.min() <= MORE:
         return recipe
     best = tried[int(np.argmax(shares <= shares.min() + 0.5 * MORE))]
@@ -285,16 +266,17 @@ def _read(
     selection: EnergySelection,
     max_pulses: int | None,
     shorten: bool,
-) -> tuple[InputSet, list[Baselines], list[tuple[Rows, Pulses]]]:
+) -> tuple[InputSet, list[tuple[Rows, Pulses]]]:
     """Read, select, prepare and collect the pulses of a file in one pass.
 
-    Without quality cuts; also baselines, and whole traces with their rows.
+    Without quality cuts; also whole measured traces with their rows.
 
     If there are more than `max_pulses`, those with the smallest random numbers stay.  A pulse
     that is dropped early would also be dropped after all later ones were read, so they are a
     uniform sample of the whole file, always the same for the same file.
     """
-    sets, drawn, before = list[Prepared](), list[FloatColumn](), set[int]()
+    measured, before = side == "measured", set[int]()
+    sets, drawn = list[Prepared](), list[FloatColumn]()
     seen = list[tuple[FloatColumn, FloatColumn]]()
     baselines, whole = list[Baselines](), list[tuple[Rows, Pulses]]()
     first, rng, start, n = np.empty((0, 0), np.float32), np.random.default_rng(0), 0, 0
@@ -307,12 +289,11 @@ def _read(
                     recipe = _within_traces(block[:TRIED], recipe, source.path.name)
                 config = recipe.at(source.dt_ns).preparation
             # baselines are of pulses of any energy
-            of_all = side == "measured" and sum(map(len, baselines)) < TRACES
+            of_all = measured and sum(map(len, baselines)) < TRACES
             part, prepared = _selected(block, config, side, selection, before, of_all)
             if of_all:
-                like = baselines[:1]
-                baselines.append(Baselines.of_block(block, prepared, config, *like))
-            if side == "measured":
+                baselines.append(Baselines.of_block(block, prepared, config, *baselines[:1]))
+            if measured:
                 good = block.waveforms[np.isfinite(block.waveforms).all(axis=1)]
                 lowest, highest = good.min(initial=lowest), good.max(initial=highest)
                 rows = part.index[: max(WHOLE - sum(len(traces) for _, traces in whole), 0)]
@@ -325,21 +306,20 @@ def _read(
                 n = _thin(sets, drawn, max_pulses)
             bar.update(len(block))
     energies, heights = map(np.concatenate, zip(*seen, strict=True))
-    if not n:
-        codes = np.concatenate([part.codes for part in sets])
-        raise _nothing_left(source.path, codes, first, energies, heights, side, selection)
     if max_pulses is not None and n > max_pulses:
         _thin(sets, drawn, max_pulses)
-    if side == "measured" and not file.insist:
-        require_sense(source.path, first, energies, heights)
     if highest >= lowest and (first == first.round()).all():
         counts = int(lowest), int(highest)
-    energies = energies[np.isfinite(energies)]
     inputs = InputSet(
-        _joined(sets), source.dt_ns, source.path, energies, recipe, None, file.options,
-        recorded_detector(source), None, counts,
+        _joined(sets), source.dt_ns, source.path, energies[np.isfinite(energies)], recipe, None,
+        file.options, provenance.recorded_detector(source),
+        Baselines.concatenate(baselines) if measured else None, counts,
     )  # fmt: skip
-    return inputs, baselines, whole
+    if not n:
+        raise _nothing_left(inputs, selection, first, heights)
+    if measured and not file.insist:
+        provenance.require_sense(source.path, first, energies, heights)
+    return inputs, whole
 
 
 def _joined(sets: list[Prepared]) -> Prepared:
@@ -399,42 +379,37 @@ def _thin(sets: list[Prepared], drawn: list[FloatColumn], max_pulses: int) -> in
 
 
 def _nothing_left(
-    path: Path,
-    codes: Codes,
-    traces: FloatArray,
-    kev: FloatColumn,
-    amplitudes: FloatColumn,
-    side: Kind,
-    selection: EnergySelection,
+    inputs: InputSet, selection: EnergySelection, traces: FloatArray, amplitudes: FloatColumn
 ) -> CpunetError:
     """Why no pulse can be used, as traces or energies show it, or the most frequent reason."""
-    rolled = rolled_over(traces)
+    path, codes, kev = inputs.path, inputs.prepared.codes, inputs.energies_kev
+    measured, rolled = inputs.baselines is not None, provenance.rolled_over(traces)
     if rolled is not None and rolled.share >= FEW_ROLLED:
-        return CpunetError(f"{path}: {rolled}", rolled.remedy)
+        return CpunetError(f"{path}: {rolled.text}", rolled.remedy)
     if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
         return CpunetError(
             f"{path}: the traces go down: their polarity is negative",
             "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",
         )
-    reasons = ", ".join(f"{n} {reason}" for reason, n in rejections_of(codes).items())
+    reasons = ", ".join(f"{n} {why}" for why, n in inputs.prepared.rejections.items())
     text = f"{path}: none of {len(codes)} pulses can be used ({reasons})"
     # of pulses of the wanted energies, if there are any, since these are what is missed
     wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)
     reason = int((wanted if wanted.sum() >= FEW else np.bincount(codes)).argmax())
     error = CpunetError(text, _REMEDIES[Rejection(reason)])
-    kev = kev[np.isfinite(kev)]
     if not len(kev):
         calibration = suggested_calibration(amplitudes)
-        text = f"{error}; their amplitudes look like {calibration}"
-        return error if calibration is None else CpunetError(text)
+        like = f"{error}; their amplitudes look like {calibration}"
+        return error if calibration is None else CpunetError(like)
     if selection.select(kev).any():
         return error
     low, middle, high = np.quantile(kev, (0.05, 0.5, 0.95))
-    text = f"{error}. Energies there: {low:.4g} to {high:.4g} keV, half of them above "
-    text += f"{middle:.4g}"
-    give = "give `kev_per_adc`" if side == "measured" else "multiply them in the file by"
-    from_kev = max(np.floor(low / 100) * 100, LOW_KEV)
-    if high > MAX_KEV and side == "measured":
+    text = (
+        f"{error}. Energies there: {low:.4g} to {high:.4g} keV, half of them above {middle:.4g}"
+    )
+    give = "give `kev_per_adc`" if measured else "multiply them in the file by"
+    from_kev = max(np.floor(low / 100) * 100, provenance.LOW_KEV)
+    if high > MAX_KEV and measured:
         text += f": if these are ADC counts, {give}"
     elif 0 < high < MIN_KEV:
         text += f": if these are MeV, {give} 1000"
@@ -457,18 +432,20 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
         If a selected line or range has pulses on one side only.
     """
     for part in selection.parts:
-        sides = (sim, data)
-        counts = [int(part.select(side.prepared.pulses.energy_kev).sum()) for side in sides]
-        if max(counts) == 0:
+        counts = {
+            side: int(part.select(side.prepared.pulses.energy_kev).sum())
+            for side in (sim, data)
+        }
+        missing, other = sorted(counts, key=lambda side: counts[side])
+        if not counts[other]:
             raise CpunetError(
                 f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be used",
                 "leave it out of `peak`",
             )
-        if min(counts) == 0:
-            missing, other = sides if counts[0] == 0 else (data, sim)
+        if not counts[missing]:
             raise CpunetError(
                 f"{missing.path}: no pulse of {part.name} can be used, {other.path.name} has "
-                f"{max(counts)}",
+                f"{counts[other]}",
                 "leave it out of `peak`, or give a file that has them",
             )
     lines = selection.lines_in_ranges

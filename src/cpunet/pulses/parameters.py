@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -27,8 +27,7 @@ from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 Values = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Parameter:
+class Parameter(NamedTuple):
     """Label and unit of a parameter for an axis."""
 
     label: str
@@ -274,13 +273,11 @@ def pulse_parameters(
         ``current_amplitude`` in pulse heights per sample, ``drift_time`` in ns and
         ``tail_slope`` in 1/ms.
     """
-    waveforms = pulses.waveforms
+    waveforms, dt_ns = pulses.waveforms, pulses.dt_ns
     return {
-        "current_amplitude": current_amplitude(waveforms, pulses.dt_ns),
-        "drift_time": drift_time(waveforms, pulses.dt_ns, scores.drift_start_fraction),
-        "tail_slope": tail_slope(
-            waveforms, pulses.dt_ns, preparation.at(pulses.dt_ns).decay_fit_samples
-        ),
+        "current_amplitude": current_amplitude(waveforms, dt_ns),
+        "drift_time": drift_time(waveforms, dt_ns, scores.drift_start_fraction),
+        "tail_slope": tail_slope(waveforms, dt_ns, preparation.at(dt_ns).decay_fit_samples),
     }
 
 
@@ -291,13 +288,8 @@ PAD = 8  # samples of the edge value; the effect of the spline's end falls 3.7-f
 def _spline(near: Sequence[Values], t: Values) -> Values:
     """Cubic spline of coefficients at -1, 0, 1 and 2, at times between 0 and 1."""
     s = 1 - t
-    weights = (
-        s * s * s / 6,
-        (3 * t * t * t - 6 * t * t + 4) / 6,
-        (3 * s * s * s - 6 * s * s + 4) / 6,
-        t * t * t / 6,
-    )
-    a, b, c, d = (w * values for w, values in zip(weights, near, strict=True))
+    weights = s * s * s, 3 * t * t * t - 6 * t * t + 4, 3 * s * s * s - 6 * s * s + 4, t * t * t
+    a, b, c, d = (w / 6 * values for w, values in zip(weights, near, strict=True))
     return np.asarray(a + b + c + d)
 
 

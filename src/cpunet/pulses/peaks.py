@@ -60,18 +60,15 @@ def label_peaks(
     >>> label_peaks([2610.0, 1000.0, np.nan], lines).tolist()
     ['FEP', '', '']
     """
-    energies = np.asarray(energy_kev, np.float64)
-    names = np.array(["", *peaks])
-    if not peaks:
-        return np.zeros(len(energies), names.dtype)
-    centres = np.array([peak.energy_kev for peak in peaks.values()])
-    widths = np.array([peak.half_width_kev for peak in peaks.values()])
-    distance = np.abs(energies[:, np.newaxis] - centres)
+    energies, names = np.asarray(energy_kev, np.float64), np.array(["", *peaks])
+    lines = [(0.0, -1.0), *((peak.energy_kev, peak.half_width_kev) for peak in peaks.values())]
+    centres, widths = np.transpose(lines)
     # NaN is in no window, since every comparison with it is false.
-    distance = np.where(distance <= widths, distance, np.inf)
-    nearest = distance.argmin(axis=1)
-    within = np.isfinite(distance.min(axis=1))
-    return names[np.where(within, nearest + 1, 0)]
+    distance = np.abs(energies[:, np.newaxis] - centres)
+    nearest: npt.NDArray[np.intp] = np.where(distance <= widths, distance, np.inf).argmin(
+        axis=1
+    )
+    return names[nearest]
 
 
 @dataclass(frozen=True)
@@ -140,28 +137,24 @@ def parse_selection(text: str, peaks: Mapping[str, PeakConfig]) -> EnergySelecti
     >>> parse_selection("300-2000", {}).select([299.9, 300, 1999, 2000]).tolist()
     [False, True, True, False]
     """
-    chosen: list[str] = []
-    ranges: list[tuple[float, float]] = []
+    chosen, ranges = dict[str, None](), dict[tuple[float, float], None]()  # each counts once
     for part in (part.strip() for part in text.split(",")):
         if part in peaks:
-            chosen.append(part)
-            continue
-        match = _RANGE.fullmatch(part)
-        if match is None:
+            chosen[part] = None
+        elif match := _RANGE.fullmatch(part):
+            low, high = float(match[1]), float(match[2] or np.inf)
+            if low >= high:
+                raise CpunetError(
+                    f"energies {text!r}: the range {part!r} is empty; give the lower end first"
+                )
+            ranges[low, high] = None
+        else:
             names = ", ".join(peaks) or "none"
             raise CpunetError(
                 f"energies {text!r}: {part!r} is no known peak ({names}) "
                 "and no range in keV such as 300-3000 or 300-"
             )
-        low, high = float(match[1]), float(match[2] or np.inf)
-        if low >= high:
-            raise CpunetError(
-                f"energies {text!r}: the range {part!r} is empty; give the lower end first"
-            )
-        ranges.append((low, high))
-    # what is given twice counts once
-    lines_once, ranges_once = tuple(dict.fromkeys(chosen)), tuple(dict.fromkeys(ranges))
-    return EnergySelection(text, peaks, lines_once, ranges_once)
+    return EnergySelection(text, peaks, tuple(chosen), tuple(ranges))
 
 
 def line_near(energies_kev: npt.ArrayLike, expected_kev: float) -> float | None:

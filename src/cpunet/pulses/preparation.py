@@ -35,7 +35,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses import _kernels
 from cpunet.pulses._kernels import Rejection as Rejection
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import Pulses, Which
 from cpunet.recipes.schema import CutConfig, PreparationConfig
 from cpunet.settings import Config
 
@@ -104,9 +104,7 @@ class Prepared:
         """Number of rejected pulses by reason, for the reasons that occurred."""
         return rejections_of(self.codes)
 
-    def __getitem__(
-        self, which: slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]
-    ) -> Prepared:
+    def __getitem__(self, which: Which) -> Prepared:
         """The pulses selected by a slice, a mask or row numbers.
 
         Pulses left out this way are not rejected: `codes` and the counts still describe
@@ -144,12 +142,9 @@ class Prepared:
         pulses = Pulses.concatenate([s.pulses for s in sets])
         starts = np.cumsum([0, *(s.n_read for s in sets[:-1])])
         index = [s.index + start for s, start in zip(sets, starts, strict=True)]
-        joined = {
-            name: np.concatenate([getattr(s, name) for s in sets])
-            for name in (*_PER_PULSE, "codes")
-            if name not in ("pulses", "index")
-        }
-        return cls(pulses=pulses, index=np.concatenate(index), **joined)
+        names = (*_PER_PULSE[2:], "codes")  # the first two are joined already
+        joined = {name: np.concatenate([getattr(s, name) for s in sets]) for name in names}
+        return cls(pulses, np.concatenate(index), **joined)
 
 
 _PER_PULSE = tuple(f.name for f in fields(Prepared) if f.name != "codes")
@@ -215,25 +210,18 @@ def prepare(pulses: Pulses, config: PreparationConfig, kind: Kind) -> Prepared:
     )
     n, length = len(pulses), config.length
     windows, codes = np.empty((n, length), np.float32), np.empty(n, np.uint8)
-    numbers, traces = np.empty((n, _kernels.COLUMNS)), np.ascontiguousarray(pulses.waveforms)
-    n = _kernels.prepare_block(traces, settings, windows, numbers, codes)
+    numbers, traces = np.empty((n, len(_kernels.NUMBERS))), pulses.waveforms
+    n = _kernels.prepare_block(np.ascontiguousarray(traces), settings, windows, numbers, codes)
     windows.resize((n, length), refcheck=False)  # releases the other rows without a copy
-    baseline, scale, align, rms, slope, tail_slope, chi2 = numbers[:n].T.copy()
-    rows, per_ms = np.flatnonzero(codes == Rejection.ACCEPTED), 1e6 / pulses.dt_ns
-    events = pulses.with_waveforms(pulses.waveforms[:, :0])[rows]
-    t0_ns = events.t0_ns + (align - config.samples_before) * pulses.dt_ns
-    return Prepared(
-        pulses=replace(events, waveforms=windows, t0_ns=t0_ns),
-        index=rows,
-        baseline=baseline,
-        scale=scale,
-        align_sample=align.astype(np.int64),
-        baseline_rms=rms,
-        baseline_slope=slope * per_ms,
-        tail_slope=tail_slope * per_ms,
-        chi2=chi2,
-        codes=codes,
-    )
+    columns = dict(zip(_kernels.NUMBERS, numbers[:n].T.copy(), strict=True))
+    align_sample = columns.pop("align_sample").astype(np.int64)
+    for name in ("baseline_slope", "tail_slope"):
+        columns[name] *= 1e6 / pulses.dt_ns  # per ms
+    rows = np.flatnonzero(codes == Rejection.ACCEPTED)
+    events = pulses.with_waveforms(traces[:, :0])[rows]
+    t0_ns = events.t0_ns + (align_sample - config.samples_before) * pulses.dt_ns
+    events = replace(events, waveforms=windows, t0_ns=t0_ns)
+    return Prepared(events, rows, codes=codes, align_sample=align_sample, **columns)
 
 
 # With fewer pulses the MAD is meaningless and no window is set.
@@ -297,12 +285,8 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
         raise CpunetError("no pulses to draw quality cuts from; select more energies or files")
     amplitude = float(np.median(prepared.scale))
     noise = float(np.median(prepared.baseline_rms * prepared.scale))
-    sigmas = {
-        "tail_slope": config.decay_sigmas,
-        "chi2": config.chi2_sigmas,
-        "baseline": config.baseline_sigmas,
-        "baseline_slope": config.baseline_sigmas,
-    }
+    sigmas = {"tail_slope": config.decay_sigmas, "chi2": config.chi2_sigmas}
+    sigmas |= dict.fromkeys(("baseline", "baseline_slope"), config.baseline_sigmas)
     windows = []
     for name, k in sigmas.items():
         values, weights = _values(prepared, name, amplitude, noise)

@@ -1,23 +1,26 @@
 """Side and origin of the pulses of a file: as recorded by this program, or as they look.
 
 What is in a file of pulses, in words: counts, energies, lines, traces.
+
+Signs that pulses are not what they are given as: the other side, counts that roll over,
+energies of other events, and a second rate.
 """
 
 from __future__ import annotations
 
 import json
+import logging
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import FloatArray, Pulses, line_slope
 from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.peaks import label_peaks, suggested_calibration
 from cpunet.pulses.reading.source import PulseSource, amplitude
@@ -28,6 +31,10 @@ from cpunet.tables import counted, span
 if TYPE_CHECKING:
     from cpunet.pulses.preparation import Kind
 
+log = logging.getLogger(__name__)
+
+Words = list[tuple[str, str]]
+Values = npt.NDArray[np.float64]
 
 # attributes of a table, and of a file
 SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
@@ -45,8 +52,7 @@ _SMALL = 1e-5  # of the height: rounding of a flat line
 _MIN_END = 0.98  # of the height: without electronics a pulse ends at its maximum
 
 
-@dataclass(frozen=True)
-class Recognised:
+class Recognised(NamedTuple):
     """Recognised side of a set of pulses.
 
     Parameters
@@ -88,27 +94,23 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
     if side is None and not insist:
         side = apparent_side(next(source.blocks(_FIRST_PULSES)).waveforms)
     if side is not None and side.side != wanted:
-        begin = " If" if remedy.endswith("?") else "; if"
-        sure = "" if side.certain else f"{begin} they are {wanted}, say so with `insist`"
-        raise CpunetError(
-            f"{source.path}: given as {wanted} pulses, but these {side.why}", f"{remedy}{sure}"
-        )
+        if not side.certain:
+            begin = " If" if remedy.endswith("?") else "; if"
+            remedy += f"{begin} they are {wanted}, say so with `insist`"
+        text = f"{source.path}: given as {wanted} pulses, but these {side.why}"
+        raise CpunetError(text, remedy)
 
 
 def recorded_side(source: PulseSource) -> Recognised | None:
     """Side recorded in a file that this program wrote; None for other files."""
     side, made_by = source.attrs.get(SIDE), source.attrs.get(MADE_BY, "")
-    translated_by = source.attrs.get(TRANSLATED_BY)
-    if translated_by in _NETWORKS:
-        kind: Kind = "measured" if translated_by == REN else "simulated"
-        why = f"were translated by {_NETWORKS[translated_by]} already"
-        return Recognised(kind, why, certain=True)
+    if network := _NETWORKS.get(source.attrs.get(TRANSLATED_BY, "")):
+        why = f"were translated by {network} already"
+        return Recognised("measured" if network == "REN" else "simulated", why, True)
     if made_by.startswith(SIMULATE) or side == "simulated":
-        return Recognised("simulated", f"were simulated by {made_by}", certain=True)
+        return Recognised("simulated", f"were simulated by {made_by}", True)
     if side == "measured":
-        return Recognised(
-            "measured", f"are traces behind electronics ({made_by})", certain=True
-        )
+        return Recognised("measured", f"are traces behind electronics ({made_by})", True)
     return None
 
 
@@ -156,10 +158,10 @@ def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
     whole = (traces == np.round(traces)).all() and np.median(height) > _FULL_HEIGHT
     if whole and turns[0] >= _TURNS:
         why = "look measured (whole numbers with noise before the pulse)"
-        return Recognised("measured", why, certain=False)
+        return Recognised("measured", why, False)
     end = (traces[:, -few:].mean(axis=1) - traces.min(axis=1)) / height
     if max(turns) < _TURNS and np.median(end) > _MIN_END:
-        return Recognised("simulated", "look simulated (no noise, no decay)", certain=False)
+        return Recognised("simulated", "look simulated (no noise, no decay)", False)
     return None
 
 
@@ -175,26 +177,22 @@ def provenance(source: PulseSource) -> dict[str, str]:
     attrs = source.attrs
     words = {"made by": attrs.get(MADE_BY, ""), "side": attrs.get(SIDE, "")}
     if translated_by := attrs.get(TRANSLATED_BY):
-        run = attrs.get(RUN) or "an unknown run"
-        network = _NETWORKS.get(translated_by, translated_by)
-        words["translated"] = f"by the {network} of {run}"
+        network, run = _NETWORKS.get(translated_by, translated_by), attrs.get(RUN)
+        words["translated"] = f"by the {network} of {run or 'an unknown run'}"
     # other programs may have attributes of these names
     with suppress(ValueError, LookupError, TypeError, AttributeError):
         made = json.loads(attrs[SIMULATION])
         detector, hits, fwhm = made["detector"], made["hits"], made["settings"]["cloud_fwhm_mm"]
         physics = f"{detector['bias_V']:g} V, {detector['temperature_K']:g} K"
-        simulated = {
-            "detector": f"{detector['name']}, {physics}, charge clouds of {fwhm:g} mm",
-            "hits": hits.get("monte_carlo", ""),
-        }
+        of_hits, of_events = hits.get("monte_carlo", ""), ""
         if "file" in hits:
             flipped = ", z flipped" if hits["flip_z"] else ""
-            origin = f"origin {hits['origin_mm']} mm{flipped}"
-            simulated["hits"] = f"{Path(hits['file']).name}, {origin}"
+            of_hits = f"{Path(hits['file']).name}, origin {hits['origin_mm']} mm{flipped}"
         if "events" in made:  # a stand records them in its ``stand.json``
             lost = f"of which {made['events_without_signal']} without a signal"
-            simulated["events"] = f"{made['events']}, {lost}; seed {made['seed']}"
-        words |= simulated
+            of_events = f"{made['events']}, {lost}; seed {made['seed']}"
+        of_detector = f"{detector['name']}, {physics}, charge clouds of {fwhm:g} mm"
+        words |= {"detector": of_detector, "hits": of_hits, "events": of_events}
     with suppress(ValueError, LookupError, TypeError, AttributeError):
         given = flat(json.loads(attrs[TRANSLATION])["options"], " ")
         words["options"] = ", ".join(f"{k} {v}" for k, v in given if v is not None)
@@ -204,9 +202,6 @@ def provenance(source: PulseSource) -> dict[str, str]:
 MIN_SIGMAS = 5.0  # least height of a pulse in standard deviations of the noise
 MIN_BASELINE = 16  # minimum number of samples to estimate the noise
 MIN_NUMBER = 10  # minimum number of traces
-
-Words = list[tuple[str, str]]
-Values = npt.NDArray[np.float64]
 
 
 def trace_properties(whole: Pulses, config: PreparationConfig) -> Words:
@@ -326,3 +321,153 @@ def describe_pulses(
         ("amplitudes", amplitudes),
         ("samples", f"values {span(ends)}{odds}"),
     ]
+
+
+LOW_KEV = 300.0  # at lower energies, noise can be a good part of an amplitude
+MIN_PULSES = 30
+# Relative deviation from the common gain of what does not go together, and share of pulses up
+# to which amplitudes may differ as much and yet be all alike.
+FAR, ALIKE = 0.1, 0.1
+# Share of pulses whose amplitude and energy do not go together, from which they are refused,
+# and from which a warning says so.
+MAX_MISMATCHED, FEW_MISMATCHED = 0.2, 0.1
+# Samples over which noise is averaged, least part of the tail on either side of a change of
+# rate, and least factors by which noise and slope change there.
+SMOOTHED, MARGIN, MIN_NOISE, MIN_SLOPE = 64, 0.1, 1.2, 1.5
+# Counts that roll over: least period and number of traces, and share of the steep ones;
+# share of traces from which all are refused.
+LEAST_PERIOD, MIN_ROLLED, MOSTLY, MAX_ROLLED = 256, 3, 0.9, 0.2
+
+
+class RolledOver(NamedTuple):
+    """Counts that jump by a period: the share of such traces, a text, and what to do."""
+
+    share: float
+    text: str
+    remedy: str
+
+
+def rolled_over(traces: FloatArray) -> RolledOver | None:
+    """Find counts that jump by a power of two, where nothing else rises within a sample.
+
+    Parameters
+    ----------
+    traces
+        Raw traces, shape (pulses, samples).
+
+    Examples
+    --------
+    >>> ramp = 30_000 + 50.0 * np.arange(200) + np.arange(5)[:, np.newaxis]
+    >>> rolled_over(ramp) is None, rolled_over((ramp + 2**15) % 2**16).text[:43]
+    (True, '100 % of the traces jump by 65536 = 2^16 co')
+    """
+    jumps = np.abs(np.diff(traces, axis=1)).max(axis=1)
+    steep = (jumps > np.ptp(traces, axis=1) / 2) & (jumps >= LEAST_PERIOD / 2)
+    if steep.sum() < MIN_ROLLED or (traces[steep] != np.round(traces[steep])).any():
+        return None
+    period = 2 ** int(np.round(np.log2(np.median(jumps[steep]))))
+    left = np.abs(np.diff(np.unwrap(traces[steep], period=period), axis=1)).max(axis=1)
+    rolled = (np.abs(jumps[steep] - period) < period / 4) & (left < period / 4)
+    if rolled.mean() <= MOSTLY:
+        return None
+    share, because, view = float(steep.mean()), "", ""
+    if period == 2**16 and traces[steep].min() < 0:
+        because = "unsigned samples stored as signed, or "
+        view = "as unsigned (values.view('uint16') in NumPy), or "
+    text = f"{100 * share:.0f} % of the traces jump by {period} = 2^{period.bit_length() - 1} "
+    text += f"counts: {because}counts beyond the range rolled over"
+    remedy = f"write them {view}as numpy.unwrap(values.astype(float), period={period})"
+    return RolledOver(share, text, remedy)
+
+
+def mismatched(kev: Values, amplitudes: Values) -> float:
+    """Fraction of the pulses whose amplitude does not go with their energy.
+
+    Of a detector and its readout, amplitudes are energies times a gain, but for a few percent
+    by trapping, for piled-up and for saturated pulses.  Returns 0 if there are too few, or if
+    all amplitudes are alike, as of pulses that were scaled to one height.
+    """
+    with np.errstate(invalid="ignore"):
+        usable = (kev > LOW_KEV) & (amplitudes > 0)
+    if usable.sum() < MIN_PULSES:
+        return 0.0
+    both = amplitudes[usable], amplitudes[usable] / kev[usable]
+    far = [float(np.mean(np.abs(values / np.median(values) - 1) > FAR)) for values in both]
+    return far[1] if far[0] >= ALIKE else 0.0
+
+
+def second_rate(traces: FloatArray) -> tuple[int, float] | None:
+    """Find where digitisers begin to average samples, which are then longer.
+
+    Averages of m samples have less noise, by the root of m if it is white, and the decay goes
+    on m times as fast from sample to sample.
+
+    Parameters
+    ----------
+    traces
+        Raw traces, shape (pulses, samples).
+
+    Returns
+    -------
+    tuple or None
+        The sample at which they begin, and how many they average.
+    """
+    heights = amplitude(traces)
+    good = np.isfinite(heights) & (heights > 0)
+    if good.sum() < MIN_PULSES:
+        return None
+    heights, traces = heights[good, np.newaxis], traces[good]
+    start = int(np.median(traces.argmax(axis=1))) + SMOOTHED
+    tail: Values = traces[:, start:].astype(np.float64)
+    n = tail.shape[1]
+    margin = max(2 * SMOOTHED, round(MARGIN * n))
+    if n < 3 * margin:
+        return None
+    noise = np.log(np.median(np.abs(np.diff(tail, 2, axis=1)), axis=0) + 1e-9)  # (samples,)
+    places, sums = np.arange(margin, n - margin), np.append(0.0, np.cumsum(noise))
+    left, others = sums[places] / places, len(noise) - places
+    right = (sums[-1] - sums[places]) / others
+    best = int(((left - right) ** 2 * places * others).argmax())
+    at, lower = int(places[best]), float(np.exp(left[best] - right[best]))
+    baselines = traces.max(axis=1, keepdims=True) - heights
+    level = np.log(np.maximum(np.median((tail - baselines) / heights, axis=0), 1e-3))
+    before, after = (line_slope(len(part)) @ part for part in (level[:at], level[at:]))
+    faster = float(after / before) if before < 0 else 0.0
+    if lower < MIN_NOISE or faster < MIN_SLOPE:
+        return None
+    return start + at + 1, faster
+
+
+def require_sense(path: Path, traces: FloatArray, kev: Values, amplitudes: Values) -> None:
+    """Refuse counts that roll over, and energies of other pulses; warn of a second rate.
+
+    Parameters
+    ----------
+    path
+        The file.
+    traces
+        Its first traces, shape (pulses, samples).
+    kev, amplitudes
+        Energies and amplitudes of all pulses.
+    """
+    if (rolled := rolled_over(traces)) is not None:
+        error = CpunetError(f"{path}: {rolled.text}", rolled.remedy)
+        if rolled.share >= MAX_ROLLED:
+            raise error
+        log.warning(str(error))
+    share = mismatched(kev, amplitudes)
+    text = f"{path}: {100 * share:.0f} % of amplitudes and energies do not go together"
+    if share > MAX_MISMATCHED:
+        raise CpunetError(
+            f"{text}: these energies are not those of these traces",
+            "give the energy column of the same channel and events, in their order; select "
+            "lower energies (`peak`) where amplitudes saturate, cut samples that pad records",
+        )
+    if share > FEW_MISMATCHED:
+        log.warning(text)
+    if (begins := second_rate(traces)) is not None:
+        log.warning(
+            f"{path}: noise and slope of the tails change at sample {begins[0]}, as if "
+            f"{begins[1]:.0f} samples were averaged from there: a second rate; cut the traces "
+            "there, or resample them"
+        )

@@ -91,11 +91,8 @@ def legend_parameters(
     filtered[:, : len(weights)] = 0.0  # which needs samples before the record
     times["tp_0_est"] = crossings(filtered, np.maximum(noise, SILENT), filtered.argmax(axis=1))
 
-    areas = {}
-    for name, begin, over_ns in (
-        ("lq", times.pop("tp_80"), LATE_NS),
-        ("dt_eff", times["tp_0_est"], EFFECTIVE_NS),
-    ):
+    areas, begins = {}, {"lq": times.pop("tp_80"), "dt_eff": times["tp_0_est"]}
+    for (name, begin), over_ns in zip(begins.items(), (LATE_NS, EFFECTIVE_NS), strict=True):
         n = round(over_ns / dt_ns)
         areas[name] = over_ns * trap_pickoff(corrected, n, 0, begin + 2 * n) / height
     times = {name: (time - aligned) * dt_ns for name, time in times.items()}
@@ -106,33 +103,22 @@ def legend_parameters(
 # Fractions of the maximum at which a pulse is timed.
 TIME_POINTS = {"t01": 0.01, "t10": 0.1, "t50": 0.5, "t90": 0.9, "t99": 0.99}
 # Rise times: the time points at which they begin and end.
-RISE_TIMES = {
-    "rise_10_90": ("t10", "t90"),
-    "rise_01_90": ("t01", "t90"),
-    "rise_01_99": ("t01", "t99"),
-    "rise_10_99": ("t10", "t99"),
-    "rise_90_99": ("t90", "t99"),
-}
+_RISES = ("10_90", "01_90", "01_99", "10_99", "90_99")
+RISE_TIMES = {f"rise_{name}": tuple(f"t{end}" for end in name.split("_")) for name in _RISES}
 
 
 # Definitions and sources are in docs/parameters.md.
 SHAPE_PARAMETERS: dict[str, Parameter] = {
     "current_amplitude": PARAMETERS["current_amplitude"],
     "drift_time": PARAMETERS["drift_time"],
-    **{
-        name: Parameter(f"t({100 * fraction:g} %)", "ns")
-        for name, fraction in TIME_POINTS.items()
-    },
+    **{name: Parameter(f"t({100 * f:g} %)", "ns") for name, f in TIME_POINTS.items()},
     **{
         name: Parameter(
-            f"Rise time {100 * TIME_POINTS[begin]:g}–{100 * TIME_POINTS[end]:g} %", "ns"
+            f"Rise time {'–'.join(f'{100 * TIME_POINTS[t]:g}' for t in ends)} %", "ns"
         )
-        for name, (begin, end) in RISE_TIMES.items()
+        for name, ends in RISE_TIMES.items()
     },
-    "tp_0_est": Parameter("tp_0_est", "ns"),
-    "tp_50": Parameter("tp_50", "ns"),
-    "tp_90": Parameter("tp_90", "ns"),
-    "tp_99": Parameter("tp_99", "ns"),
+    **{name: Parameter(name, "ns") for name in ("tp_0_est", "tp_50", "tp_90", "tp_99")},
     "rise_time": Parameter("T(10–90 %)", "ns"),
     "dt_eff": Parameter("Effective drift time dt_eff", "ns"),
     "lq": Parameter("Late charge LQ", "ns"),
@@ -203,20 +189,22 @@ def all_parameters(
         decay_ns = median_decay_ns(
             tail_slope(pulses.waveforms[finite], dt_ns, preparation.decay_fit_samples)
         )
-    lever = np.arange(preparation.baseline_samples) - (preparation.baseline_samples - 1) / 2
+    n, aligned = preparation.baseline_samples, preparation.samples_before
+    lever = np.arange(n) - (n - 1) / 2
     for rows in blocks(len(pulses), BLOCK):
         good = rows.start + np.flatnonzero(np.isfinite(pulses.waveforms[rows]).all(axis=1))
         block = np.array(pulses.waveforms[good], dtype=np.float32, order="C")
         # overflows become NaN below
         with np.errstate(all="ignore"):
+            given = None if amplitudes is None else amplitudes[good]
             columns = {
                 "current_amplitude": current_amplitude(block, dt_ns)
-                if amplitudes is None
-                else amplitudes[good],
+                if given is None
+                else given,
                 "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
                 "tail_slope": tail_slope(block, dt_ns, preparation.decay_fit_samples),
             }
-            baselines, n = block[:, : preparation.baseline_samples].astype(float), lever.size
+            baselines = block[:, :n].astype(float)
             baselines -= baselines.mean(axis=1, keepdims=True)
             baselines -= np.outer(baselines @ lever / (lever @ lever), lever)  # about a line
             columns["baseline_rms"] = np.sqrt((baselines**2).sum(axis=1) / (n - 2))
@@ -224,13 +212,12 @@ def all_parameters(
             levels = np.outer(np.where(height > 0, height, np.nan), levels).astype(np.float32)
             top = block.argmax(axis=1)[:, np.newaxis]
             samples = crossings(block[:, np.newaxis].astype(float), levels.astype(float), top)
-            times = (samples - preparation.samples_before) * dt_ns
-            columns |= dict(zip(TIME_POINTS, times.T, strict=True))
+            columns |= dict(zip(TIME_POINTS, (samples.T - aligned) * dt_ns, strict=True))
             for name, (begin, end) in RISE_TIMES.items():
                 columns[name] = columns[end] - columns[begin]
         columns = {name: np.where(np.isfinite(c), c, np.nan) for name, c in columns.items()}
-        how = (decay_ns, columns["baseline_rms"], dt_ns, preparation.samples_before)
-        for name, column in (columns | legend_parameters(block, *how)).items():
+        columns |= legend_parameters(block, decay_ns, columns["baseline_rms"], dt_ns, aligned)
+        for name, column in columns.items():
             values[name][good] = column
     return values
 
@@ -281,8 +268,7 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
     if finite.size == 0:
         raise CpunetError("the data have no finite value to bin; check the peak's selection")
     lower, upper = np.quantile(finite, [0.25, 0.75])
-    spread = upper - lower
-    if spread > 0:
+    if (spread := upper - lower) > 0:
         low = max(finite.min(), lower - FENCE * spread)
         high = min(finite.max(), upper + FENCE * spread)
         width = 2 * spread / np.cbrt(finite.size)
@@ -307,13 +293,11 @@ def labelled(
     CpunetError
         If there are no so many bins.
     """
-    edges = axis.edges
     if bins is not None and bins < 1:
         raise CpunetError(f"`bins` is {bins}", "give 1 or more")
+    low, *_, high = axis.edges
     label = LABELLED[parameter].axis_label
-    return hist.axis.Regular(
-        bins or axis.size, edges[0], edges[-1], name=parameter, label=label
-    )
+    return hist.axis.Regular(bins or axis.size, low, high, name=parameter, label=label)
 
 
 class Histogram(hist.Hist[Any], family=hist):

@@ -130,16 +130,9 @@ def classifier_auc(
     aucs, stds = _cross_validated(_expanded(windows, extra), rng)
     null_std, delong = aucs[1:].std(ddof=1), np.sqrt((stds[1:] ** 2).mean())
     widened = max(1.0, null_std / delong) if delong > 0 else 1.0
-    return TwoSample(
-        auc=float(aucs[0]),
-        auc_std=float(widened * stds[0]),
-        null_mean=float(aucs[1:].mean()),
-        null_std=float(null_std),
-        n_data=size,
-        n_sim=size,
-        missing_data=len(data) - len(usable[0]),
-        missing_sim=len(others) - len(usable[1]),
-    )
+    missing = (len(side) - len(rows) for side, rows in zip(sides, usable, strict=True))
+    auc, auc_std, null_mean = float(aucs[0]), float(widened * stds[0]), float(aucs[1:].mean())
+    return TwoSample(auc, auc_std, null_mean, float(null_std), size, size, *missing)
 
 
 def auc_and_variance(negatives: Values, positives: Values) -> tuple[Values, Values]:

@@ -36,7 +36,7 @@ Columns = Mapping[str, tuple[npt.ArrayLike, str] | LGDO]
 # Chunks of whole traces: a block of events is read without decompressing others.
 _CHUNK_BYTES = 1 << 18
 # Lowest gzip level: noise hardly compresses further, and it takes half the time.
-_GZIP_LEVEL = 1
+_COMPRESSION = {"compression": "gzip", "compression_opts": 1, "shuffle": True}
 
 
 @dataclass(eq=False)
@@ -90,13 +90,11 @@ class PulseWriter:
     force: bool = False
     n_pulses: int = field(default=0, init=False)
 
-    def __post_init__(self) -> None:
+    def __enter__(self) -> Self:
         if not self.table.strip("/"):
             raise CpunetError(f"{self.path}: the table has no name; give one such as geds/sim")
         refuse_existing(Path(self.path), force=self.force)
         self._stack = ExitStack()
-
-    def __enter__(self) -> Self:
         written = written_hdf5(Path(self.path))
         self._file, self._held = self._stack.enter_context(written)
         return self
@@ -121,20 +119,12 @@ class PulseWriter:
         if len(pulses) == 0:
             return
         n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
-        values = ArrayOfEqualSizedArrays(
-            nda=pulses.waveforms.astype(self.samples, copy=False),
-            attrs={
-                # not called "units": dspeed copies that attribute to its table buffer, which
-                # the LH5 library then refuses to fill a second time
-                "sample_units": self.waveform_units,
-                "hdf5_settings": {
-                    "chunks": (n_rows, pulses.length),
-                    "compression": "gzip",
-                    "compression_opts": _GZIP_LEVEL,
-                    "shuffle": True,
-                },
-            },
-        )
+        settings = {"chunks": (n_rows, pulses.length), **_COMPRESSION}
+        # not called "units": dspeed copies that attribute to its table buffer, which the LH5
+        # library then refuses to fill a second time
+        attrs = {"sample_units": self.waveform_units, "hdf5_settings": settings}
+        samples = pulses.waveforms.astype(self.samples, copy=False)
+        values = ArrayOfEqualSizedArrays(nda=samples, attrs=attrs)
         times = {"t0": np.array(pulses.t0_ns), "dt": np.full(len(pulses), pulses.dt_ns)}
         content: Columns = {
             "waveform": WaveformTable(**times, t0_units="ns", dt_units="ns", values=values),
@@ -159,9 +149,7 @@ class PulseWriter:
             Attributes of the table.
         """
         content = {
-            name: column
-            if isinstance(column, LGDO)
-            else _array(np.asarray(column[0]), column[1])
+            name: column if isinstance(column, LGDO) else _array(*column)
             for name, column in columns.items()
         }
         if len(next(iter(content.values()))) == 0:
@@ -177,8 +165,8 @@ class PulseWriter:
         item.attrs[name] = text
 
 
-def _array(values: npt.NDArray[Any], units: str) -> Array:
-    return Array(values, attrs={"units": units} if units else {})
+def _array(values: npt.ArrayLike, units: str) -> Array:
+    return Array(np.asarray(values), attrs={"units": units} if units else {})
 
 
 class HeldFile(io.FileIO):
@@ -194,21 +182,21 @@ class HeldFile(io.FileIO):
         """Write everything, unless this or an earlier write fails."""
         left = memoryview(data).cast("B")
         size = len(left)
-        try:
-            while len(left) and self.failure is None:
+        while len(left) and self.failure is None:
+            try:
                 left = left[super().write(left) :]
-        except OSError as error:
-            self.failure = error
+            except OSError as error:
+                self.failure = error
         return size
 
     def truncate(self, size: int | None = None, /) -> int:
         """Change the size, unless this or an earlier call fails."""
-        try:
-            if self.failure is None:
+        if self.failure is None:
+            try:
                 return super().truncate(size)
-        except OSError as error:
-            self.failure = error
-        return 0 if size is None else size
+            except OSError as error:
+                self.failure = error
+        return size or 0
 
     def require_written(self) -> None:
         """Raise the failure, if any."""

@@ -33,7 +33,7 @@ from scipy.ndimage import binary_erosion
 from cpunet.errors import CpunetError
 from cpunet.outputs import written_aside
 from cpunet.progress import stage
-from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.pulses.reading.other_formats import read_arrays
 from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
 from cpunet.simulation.outline import DITCH, GERMANIUM, LI_CONTACT
 from cpunet.simulation.poisson import (

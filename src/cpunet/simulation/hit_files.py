@@ -18,8 +18,8 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import item_at, members, opened, units_of
 from cpunet.pulses.peaks import label_peaks
-from cpunet.pulses.reading.arrays import read_arrays
-from cpunet.pulses.reading.columns import (
+from cpunet.pulses.reading.other_formats import read_arrays
+from cpunet.pulses.reading.source import (
     Texts,
     divides,
     dividing,

@@ -35,7 +35,7 @@ from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
-from cpunet.pulses.reading.arrays import read_arrays
+from cpunet.pulses.reading.other_formats import read_arrays
 from cpunet.translation.translator import REN
 from cpunet.validation.metrics import PairedScores
 

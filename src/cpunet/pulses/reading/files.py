@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
@@ -133,8 +133,7 @@ class PulseFile:
 
     def __len__(self) -> int:
         with self.open() as source:
-            n = source.n_pulses
-            return sum(map(len, source.blocks())) if n is None else n
+            return source.n_pulses or sum(map(len, source.blocks()))
 
     def __iter__(self) -> Iterator[Pulses]:
         """Blocks of a few thousand pulses."""
@@ -199,18 +198,15 @@ class PulseFile:
 
     def open(self) -> PulseSource:
         """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
-        # HDF5 and FlashCam take a fifth of a second each to import
-        read: Callable[[PulseFile], PulseSource]
+        # HDF5 takes a fifth of a second to import
         format_ = "memory" if self.pulses is not None else recognise(self.path)
         if format_ == "HDF5":
-            from cpunet.pulses.reading.hdf5 import read_hdf5 as read
-        elif format_ == "FlashCam":
-            from cpunet.pulses.reading.flashcam import read_flashcam as read
-        else:
-            from cpunet.pulses.reading import arrays
+            from cpunet.pulses.reading.hdf5 import read_hdf5
 
-            read = arrays.READERS[format_]
-        return read(self).resolve(self)
+            return read_hdf5(self).resolve(self)
+        from cpunet.pulses.reading.other_formats import READERS
+
+        return READERS[format_](self).resolve(self)
 
 
 Source: TypeAlias = str | Path | PulseFile | Pulses
@@ -230,18 +226,15 @@ def pulse_file(
     if isinstance(source, str | Path):
         return PulseFile(Path(source), **how)
     if not isinstance(source, PulseFile | Pulses):
-        raise CpunetError(
-            f"{type(source).__name__}: are no pulses",
-            "give a path, a cpunet.PulseFile, or cpunet.Pulses.of(array, dt_ns=…, "
-            "energy_kev=…)",
+        give = (
+            "give a path, a cpunet.PulseFile, or cpunet.Pulses.of(array, dt_ns=…, energy_kev=…)"
         )
+        raise CpunetError(f"{type(source).__name__}: are no pulses", give)
     if given := ", ".join(name for name, value in how.items() if value):
-        raise CpunetError(
-            f"{given}: is an option of a path", "give it to the PulseFile, or leave it out"
-        )
-    if isinstance(source, PulseFile):
-        return source
-    return PulseFile(Path("pulses in memory"), pulses=source)
+        remedy = "give it to the PulseFile, or leave it out"
+        raise CpunetError(f"{given}: is an option of a path", remedy)
+    in_memory = Path("pulses in memory")
+    return source if isinstance(source, PulseFile) else PulseFile(in_memory, pulses=source)
 
 
 # First bytes of each format
@@ -323,9 +316,8 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
         If the file is missing or cannot be read.
     """
     path = Path(path)
-    format_ = recognise(path)
-    if format_ == "FlashCam":
-        from cpunet.pulses.reading.flashcam import channel_sizes
+    if (format_ := recognise(path)) == "FlashCam":
+        from cpunet.pulses.reading.other_formats import channel_sizes
 
         return channel_sizes(path)
     if format_ != "HDF5":

@@ -17,22 +17,10 @@ import h5py
 import numpy as np
 import numpy.typing as npt
 
+from cpunet import hdf5_files as h5
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import (
-    is_column,
-    item_at,
-    lh5_rows,
-    members,
-    one_line,
-    open_hdf5,
-    reading,
-    text_attribute,
-    texts_of,
-    units_of,
-)
-from cpunet.pulses.reading.columns import EVENT_KEYS, Column, divides, dividing, labels
 from cpunet.pulses.reading.files import PulseFile
-from cpunet.pulses.reading.source import PulseSource
+from cpunet.pulses.reading.source import EVENT_KEYS, Column, PulseSource, divides, parts
 from cpunet.tables import shortened
 
 # preference among several waveform columns of a table: full record, then full-rate window
@@ -47,48 +35,49 @@ _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
 
 def read_hdf5(options: PulseFile) -> PulseSource:
     """The waveforms of an HDF5 file, LH5 or not; see `open_pulses`."""
-    path, file = options.path, open_hdf5(options.path)
-    with one_line(path):
+    path, file = options.path, h5.open_hdf5(options.path)
+    with h5.one_line(path):
         name = choose_waveforms(path, file, options.place)
         table, _, own_name = name.rpartition("/")
-        group, values = file[table or "/"], file[name]
-        columns, attrs = columns_of(path, group), texts_of(file) | texts_of(group)
-        of_file = {"attrs": attrs, "group": group, "close": file.close}
-        if isinstance(values, h5py.Dataset):
+        group, values, times = file[table or "/"], file[name], dict[str, Column]()
+        columns, attrs = columns_of(path, group), h5.texts_of(file) | h5.texts_of(group)
+        if is_lh5 := isinstance(values, h5py.Group):
+            times, values = columns_of(path, values), values["values"]
+        else:
             columns.pop(own_name, None)  # one pulse is a row, as MATLAB writes a vector
-            rows = reading(path, values, lambda start, stop: np.asarray(values[start:stop]))
-            return PulseSource.of_array(
-                path, "HDF5", name, values, columns, rows=rows, **of_file
-            )
-        own, values = columns_of(path, values), values["values"]
         # a group holds the traces encoded, or as vectors of their own lengths
-        is_group, sized = isinstance(values, h5py.Group), values
-        if is_group:
+        sized = values
+        if isinstance(values, h5py.Group):
             sized = values.get("encoded_data", values).get("cumulative_length")
         n = int(sized.shape[0]) if sized is not None and sized.ndim else 0
-        first = _lh5_traces(values, None, 0, 1) if n else np.empty((0, 0))
-        longest = first.shape[1]
-        if n and is_group and "cumulative_length" in values and first.dtype.kind == "f":
-            lengths = np.diff(np.asarray(values["cumulative_length"][:], np.int64), prepend=0)
-            longest = int(lengths.max())
-            if lengths.min() < longest:
+        first = _traces(values, None, 0, 1) if n else np.empty((0, 0))
+        length = first.shape[1]
+        own = n and isinstance(values, h5py.Group) and "cumulative_length" in values
+        if own and first.dtype.kind == "f":
+            lengths = np.diff(np.asarray(sized[:], np.int64), prepend=0)
+            length = int(lengths.max())
+            if lengths.min() < length:
                 log.info(
-                    f"{path.name}: pulses of {lengths.min()} to {longest} samples are "
+                    f"{path.name}: pulses of {lengths.min()} to {length} samples are "
                     "continued with their last value"
                 )
-        rows = reading(path, values, partial(_lh5_traces, values, longest))
+
+        def rows(start: int, stop: int) -> npt.NDArray[Any]:
+            with h5.one_line(path):
+                return _traces(values, length, start, stop)
+
         return PulseSource(
-            path, "LH5", name, n, longest, rows, columns, period_name=f"{name}/dt",
-            period=own.get("dt"), t0=own.get("t0"), **of_file,
+            path, "LH5" if is_lh5 else "HDF5", name, n, length, rows, columns, times, attrs,
+            group=group, close=file.close,
         )  # fmt: skip
 
 
-def _lh5_traces(
+def _traces(
     item: h5py.Group | h5py.Dataset, length: int | None, start: int, stop: int
 ) -> npt.NDArray[Any]:
-    """Rows of LH5 traces; vectors of their own lengths are continued to `length` samples."""
+    """Rows of traces; vectors of their own lengths are continued to `length` samples."""
     plain = isinstance(item, h5py.Dataset)
-    values = item[start:stop] if plain else lh5_rows(item, start, stop - start)
+    values = item[start:stop] if plain else h5.lh5_rows(item, start, stop - start)
     if not hasattr(values, "cumulative_length"):
         traces = np.asarray(getattr(values, "nda", values))
         if traces.ndim != 2 or traces.dtype.kind not in "iuf":
@@ -100,18 +89,17 @@ def _lh5_traces(
     lengths = np.diff(values.cumulative_length.nda.astype(np.int64), prepend=0)
     expected = int(lengths[0]) if length is None else length
     flat = np.asarray(values.flattened_data.nda)[: lengths.sum()]
-    if not (other := lengths != expected).any():
-        return flat.reshape(len(lengths), expected)
-    first = int(other.argmax())
-    if flat.dtype.kind != "f":
+    other = lengths != expected
+    if other.any() and flat.dtype.kind != "f":
+        first = int(other.argmax())
         raise CpunetError(
             f"{item.file.filename}: event {start + first}: {lengths[first]} samples, others "
             f"have {expected}",
             "split the file by length; only ideal pulses are continued with their last one",
         )
-    last = np.cumsum(lengths) - 1
+    begins = np.cumsum(lengths) - lengths
     at = np.minimum(np.arange(expected), lengths[:, np.newaxis] - 1)
-    return np.asarray(flat[(last - lengths + 1)[:, np.newaxis] + at])
+    return np.asarray(flat[begins[:, np.newaxis] + at])
 
 
 def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
@@ -123,15 +111,16 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
         If there is no such table, or not exactly one choice; the message lists the choices.
     """
     place = (table or "").strip("/")
-    item = item_at(file, place)
+    item = h5.item_at(file, place)
     if item is None:
         tables = waveform_tables(file) or list(file)
         raise CpunetError(f"{path}: no table {place}; there are {shortened(tables)}")
     if _is_lh5(item) or _is_array(item):
         return place
     folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
-    for link in (link for *_, broken in folders for link in broken):
-        item_at(file, link)  # which says what is wrong
+    for *_, broken in folders:
+        for link in broken:
+            h5.item_at(file, link)  # which says what is wrong
     columns = [column for _, _, waveforms, _ in folders for column in waveforms]
     if len(columns) == 1:
         return columns[0]
@@ -141,11 +130,10 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     names = {column.rpartition("/")[2]: column for column in columns}
     best = next((name for name in _PREFERRED if name in names), None)
     if len(tables) > 1 or best is None:
-        several, what = columns, "waveform columns ("
-        if len(tables) > 1:
-            several, what = tables, "tables of waveforms ("
+        several = tables if len(tables) > 1 else columns
+        what = "tables of waveforms" if len(tables) > 1 else "waveform columns"
         raise CpunetError(
-            f"{path}: {len(several)} {what}{shortened(several)}); choose one with `table` "
+            f"{path}: {len(several)} {what} ({shortened(several)}); choose one with `table` "
             "(`sim_table`, `data_table`)"
         )
     others = ", ".join(sorted(names.keys() - {best}))
@@ -178,10 +166,10 @@ def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
 
 def waveform_tables(file: h5py.File) -> list[str]:
     """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
-    tables = set[str]()
-    for path, _, waveforms, broken in _folders(file):
-        tables.update(broken or ([path] if waveforms else []))
-    return sorted(tables)
+    folders = [
+        (broken, [path] if waveforms else []) for path, _, waveforms, broken in _folders(file)
+    ]
+    return sorted({path for broken, table in folders for path in broken or table})
 
 
 def channel_tables(path: Path, file: h5py.File) -> list[str]:
@@ -189,16 +177,14 @@ def channel_tables(path: Path, file: h5py.File) -> list[str]:
     channels: list[str] = []
     for table in waveform_tables(file):
         try:
-            group = item_at(file, table) or file
+            group = h5.item_at(file, table) or file
             columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         except CpunetError:  # said where the table is opened
             columns = {}
-        rows = max((column.size for column in columns.values()), default=0)
-        whole = {n: c for n, c in columns.items() if divides(n) and c.size == rows}
-        of = {name: np.atleast_1d(column.values) for name, column in whole.items()}
-        names = dividing(of, rows)
-        parts = np.unique(labels(of, names)) if names else [""]
-        channels += [f"{table}/{part}".strip("/") for part in parts]
+        n = max((column.size for column in columns.values()), default=0)
+        whole = {name: column for name, column in columns.items() if column.size == n}
+        names = parts(whole, np.arange(n))[1] or [""]
+        channels += [f"{table}/{name}".strip("/") for name in names]
     return channels
 
 
@@ -218,10 +204,10 @@ def _folders(
     items, broken = dict[str, h5py.Group | h5py.Dataset](), list[str]()
     for name in group:
         try:
-            items[name] = item_at(group, name)
+            items[name] = h5.item_at(group, name)
         except CpunetError:
             broken.append(name)
-    is_table = text_attribute(group, "datatype").startswith("table")
+    is_table = h5.text_attribute(group, "datatype").startswith("table")
     names = [name for name, item in items.items() if _is_lh5(item)]
     names = names or [name for name in _PLAIN if _is_array(items.get(name))][:1]
     if is_table and {"dt", "values"} <= items.keys():
@@ -238,24 +224,24 @@ def _folders(
 def _is_lh5(item: object) -> bool:
     """Whether an item is an LH5 waveform table (t0, dt, values)."""
     is_group = isinstance(item, h5py.Group) and {"dt", "values"} <= item.keys()
-    return is_group and text_attribute(item, "datatype").startswith("table")
+    return is_group and h5.text_attribute(item, "datatype").startswith("table")
 
 
 def columns_of(path: Path, group: h5py.Group) -> dict[str, Column]:
     """Columns of a group: its numbers, and texts where they separate channels."""
 
     def load(item: h5py.Dataset) -> npt.NDArray[Any]:
-        with one_line(path):
+        with h5.one_line(path):
             values = np.asarray(item[()])
         return values.ravel() if values.ndim else values
 
     columns = {}
-    for name, item in members(group).items():
+    for name, item in h5.members(group).items():
         # MATLAB has no vectors, but writes a row
-        is_number = is_column(item) or (_is_array(item) and 1 in item.shape)
+        is_number = h5.is_column(item) or (_is_array(item) and 1 in item.shape)
         is_text = isinstance(item, h5py.Dataset) and item.ndim == 1 and item.dtype.kind in "SO"
         if is_number or (is_text and divides(name)):
-            columns[name] = Column(partial(load, item), item.size, units_of(item))
+            columns[name] = Column(partial(load, item), item.size, h5.units_of(item))
     return columns
 
 
@@ -269,9 +255,9 @@ def column_elsewhere(source: PulseSource, column: str) -> Column:
     """
     path, place = Path(column.rpartition(":")[0]), column.rpartition(":")[2].strip("/")
     folder, _, own = place.rpartition("/")
-    file = open_hdf5(path)
-    with one_line(path):
-        group = item_at(file, folder)
+    file = h5.open_hdf5(path)
+    with h5.one_line(path):
+        group = h5.item_at(file, folder)
         columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
         names = list(columns or file)
     if own not in columns:

@@ -1,13 +1,16 @@
-"""A file of pulses of any format, open: its traces and columns, and pulses in blocks."""
+"""A file of pulses of any format, open: its traces and columns, and pulses in blocks.
+
+Columns have a value for each event; some separate channels or detectors.
+"""
 
 from __future__ import annotations
 
 import logging
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial, reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -16,23 +19,12 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading.columns import (
-    EVENT_KEYS,
-    Column,
-    divides,
-    dividing,
-    labels,
-    some_of,
-    texts,
-    whole_numbers,
-)
 from cpunet.tables import shortened
 from cpunet.units import factor, unit_names
 
 if TYPE_CHECKING:  # of libraries that other formats do not need
     import h5py
 
-    from cpunet.hdf5_files import Read
     from cpunet.pulses.reading.files import PulseFile
 
 log = logging.getLogger(__name__)
@@ -44,6 +36,18 @@ _USUAL = ("energy_kev", "energy_keV", "energy", "energy_label")
 # LEGEND's hit tier calls calibrated energies `cuspEmax_ctc_cal` and gives them no units, the
 # release of the Majorana Demonstrator `energy_label`.
 _NAMED_IN_KEV = re.compile(r"(_cal|kev|energy_label)$", re.IGNORECASE)
+
+_NUMBERED = r"(?:_?(?:id|uid|no|nr|num|number|index|idx|name))"
+_DIVIDES = re.compile(
+    r"(?:f|fc|adc|daq|hw|fadc|digi)?_?(?:ch|chn|chan|channel|card|crate|slot|board|module|input|"
+    r"fadc|digitizer|det|detector|contact|seg|segment|crystal|core|volume|replica|geds?|hpge)"
+    rf"{_NUMBERED}?|(?:raw|vol|copy|rep|fc|daq){_NUMBERED}|irep",
+    re.IGNORECASE,
+)
+# Columns by which the rows of two files are joined; the last is no number of an event.
+EVENT_KEYS = ("event_number", "eventnumber", "evtid", "ievt", "timestamp")
+_MOST, _FEWEST = 512, 2  # channels of an experiment, and rows of each on average
+_MAX_NUMBER = 2.0**62
 
 # The first samples of a trace, before any pulse, for the amplitude's baseline.
 _BASELINE_FRACTION, _BASELINE_SAMPLES = 0.05, 10
@@ -66,6 +70,140 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
 
 
 Values = npt.NDArray[Any]
+Read = Callable[[int, int], Values]  # rows from one to before another
+Texts = npt.NDArray[np.str_]
+
+
+@dataclass(frozen=True, eq=False)
+class Column:
+    """One value per event, or a single number that applies to all events.
+
+    Parameters
+    ----------
+    load
+        Gives the values, of no dimension if they are a number that applies to all.
+    size
+        Number of values.
+    units
+        Units in the file, ``""`` if there are none.
+    """
+
+    load: Callable[[], Values]
+    size: int
+    units: str = ""
+
+    @classmethod
+    def of(cls, values: Values, units: str = "") -> Column:
+        """A column in memory."""
+        return cls(lambda: values, values.size, units)
+
+    @cached_property
+    def values(self) -> Values:
+        """All values, which are read when they are asked for."""
+        return self.load()
+
+    def at(self, rows: npt.NDArray[np.int64], n: int | None) -> Column:
+        """The values of some of `n` rows; a number for all stays."""
+        if self.size != n:
+            return self
+        return Column(lambda: self.values[rows], len(rows), self.units)
+
+
+def some_of(read: Read, rows: npt.NDArray[np.int64], start: int, stop: int) -> Values:
+    """Rows of a first to one before a last of those chosen, never more at once than these."""
+    wanted, parts = rows[start:stop], list[Values]()
+    while len(wanted):
+        n = int(np.searchsorted(wanted, wanted[0] + stop - start))
+        parts.append(read(int(wanted[0]), int(wanted[n - 1]) + 1)[wanted[:n] - wanted[0]])
+        wanted = wanted[n:]
+    return np.concatenate(parts) if parts else read(0, 0)
+
+
+def divides(name: str) -> bool:
+    """Whether a column of this name separates channels or detectors.
+
+    Examples
+    --------
+    >>> [name for name in ("channel", "fch_id", "volID", "copyNo", "epoch") if divides(name)]
+    ['channel', 'fch_id', 'volID', 'copyNo']
+    """
+    return _DIVIDES.fullmatch(name) is not None
+
+
+def texts(values: Values) -> Texts:
+    """Values as text; whole numbers without a decimal point."""
+    if values.dtype.kind == "f" and np.array_equal(values, np.rint(values)):
+        values = values.astype(np.int64)
+    if values.dtype.kind in "SO":
+        return np.array([x.decode() if isinstance(x, bytes) else str(x) for x in values])
+    return values.astype(np.str_)
+
+
+def dividing(columns: Mapping[str, Values], rows: int) -> list[str]:
+    """The fewest of some columns that part the rows as all of them do; none if none does.
+
+    Examples
+    --------
+    >>> card, channel = np.repeat([1, 2], 4), np.tile([0, 0, 3, 3], 2)
+    >>> dividing({"card": card, "channel": channel, "crate": 0 * card}, 8)
+    ['card', 'channel']
+    >>> dividing({"card": card, "channel": channel, "rawid": 10 * card + channel}, 8)
+    ['rawid']
+    """
+    chosen, groups, parts = list[str](), 1, np.zeros(rows, np.int64)
+    coded = {name: np.unique(v, return_inverse=True) for name, v in columns.items()}
+    for name in sorted(coded, key=lambda name: (-len(coded[name][0]), name)):
+        values, code = coded[name]
+        both, joined = np.unique(parts * len(values) + code, return_inverse=True)
+        if groups < len(both) <= min(_MOST, rows / _FEWEST):
+            chosen, groups, parts = [*chosen, name], len(both), joined
+    return chosen
+
+
+def labels(columns: Mapping[str, Values], names: Iterable[str]) -> Texts:
+    """Label of each row, as ``channel=3`` or ``card=1,channel=3``."""
+    parts = [np.strings.add(f"{name}=", texts(columns[name])) for name in names]
+    add = np.strings.add
+    return np.asarray(reduce(lambda label, part: add(add(label, ","), part), parts), np.str_)
+
+
+def parts(
+    columns: Mapping[str, Column], rows: npt.NDArray[np.int64]
+) -> tuple[list[str], list[str]]:
+    """The columns that part some rows, see `dividing`, and the labels of the parts."""
+    of = {name: np.atleast_1d(c.values)[rows] for name, c in columns.items() if divides(name)}
+    names = dividing(of, len(rows))
+    return names, list(np.unique(labels(of, names))) if names else []
+
+
+def whole_numbers(values: Values, where: str, start: int = 0) -> npt.NDArray[np.int64]:
+    """Numbers of events as integers; some files store them as floating-point numbers.
+
+    Parameters
+    ----------
+    values
+        A number for each row.
+    where
+        File and column, for the message.
+    start
+        Row of the first number.
+
+    Raises
+    ------
+    CpunetError
+        If one is no whole number or too large.
+    """
+    if values.dtype.kind != "i":
+        plain = values.dtype.kind in "uf"
+        numbers = values.astype(float) if plain else np.full(len(values), np.nan)
+        bad = ~((numbers == np.rint(numbers)) & (np.abs(numbers) < _MAX_NUMBER))
+        if bad.any():
+            row = int(bad.argmax())
+            raise CpunetError(
+                f"{where}: row {start + row}: {values[row]} is no number of an event; number "
+                "the events anew"
+            )
+    return values.astype(np.int64)
 
 
 @dataclass(eq=False, repr=False)
@@ -92,14 +230,13 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         a file with fewer those that are left.
     columns
         Columns with one value per trace, by name.
+    times
+        Sampling periods ``dt`` and times of the first samples ``t0`` that are no columns.
     attrs
         What the file says about the traces: side, maker, detector.
-    period_name, period
-        Name and column of the sampling period, if it is in the file.
-    t0
-        Times of the first samples, if they are in the file.
-    numbers
-        Gives the event numbers of the traces read last, if the file has any.
+    of_each
+        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
+        ``t0_ns``, and ``dt_ns`` if there are several.
     group, close
         Group of an HDF5 file with columns of any kind; closes the file.
 
@@ -113,9 +250,6 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         The rule that gives each pulse its energy, in words.
     kev_per_adc
         The factor from the amplitude to the energy, if there are no energies.
-    of_each
-        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
-        ``t0_ns``, and ``dt_ns`` if there are several.
     """
 
     path: Path
@@ -125,11 +259,9 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     length: int
     rows: Read
     columns: dict[str, Column] = field(default_factory=dict)
+    times: dict[str, Column] = field(default_factory=dict)
     attrs: Mapping[str, str] = field(default_factory=dict)
-    period_name: str = "dt"
-    period: Column | None = None
-    t0: Column | None = None
-    numbers: Read | None = None
+    of_each: dict[str, Any] = field(default_factory=dict)
     group: h5py.Group | None = None
     close: Callable[[], None] = lambda: None
     chosen: npt.NDArray[np.int64] | None = field(default=None, init=False)
@@ -137,42 +269,6 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     dt_ns: float = field(default=np.nan, init=False)
     energies: str = field(default="", init=False)
     kev_per_adc: float | None = field(default=None, init=False)
-    of_each: dict[str, Values] = field(default_factory=dict, init=False)
-
-    @classmethod
-    def of_array(
-        cls,
-        path: Path,
-        format: str,
-        name: str,
-        values: Any,
-        columns: dict[str, Column],
-        **how: Any,
-    ) -> PulseSource:
-        """An array, in memory or stored, of shape ``(traces, samples)``, and its columns.
-
-        Raises
-        ------
-        CpunetError
-            If the columns have a value for each of its samples: Julia and MATLAB write arrays
-            with their dimensions reversed.
-        """
-        n, length = values.shape
-        sizes = {column.size for column in columns.values()}
-        if length in sizes and n not in sizes:
-            raise CpunetError(
-                f"{path}: traces of shape {values.shape} with columns of {length}: their "
-                "dimensions are reversed",
-                "write them transposed, with the pulses first",
-            )
-        how = {
-            "rows": lambda start, stop: values[start:stop],
-            "period": columns.get("dt"),
-        } | how
-        if (in_ns := columns.get("dt_ns")) is not None:
-            period = Column(in_ns.load, in_ns.size, in_ns.units or "ns")
-            how |= {"period_name": "dt_ns", "period": period}
-        return cls(path, format, name, n, length, columns=columns, **how)
 
     def resolve(self, file: PulseFile) -> Self:
         """Take the rows, the sampling period and the energies that the user chose.
@@ -182,17 +278,25 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         CpunetError
             If it holds no pulses, or those of several channels, or the options do not fit.
         """
-        if self.n_pulses == 0 or self.length == 0:
+        n, sizes = self.n_pulses, {column.size for column in self.columns.values()}
+        if n == 0 or self.length == 0:
             raise CpunetError(
                 f"{self.path}: {self.name or self.format} holds no pulses; "
                 "give a file with events"
             )
-        if self.n_pulses is not None:
-            self._choose(file.rows, self.n_pulses)
+        if self.length in sizes and n not in sizes:  # as Julia and MATLAB write arrays
+            raise CpunetError(
+                f"{self.path}: traces of shape {(n, self.length)} with columns of "
+                f"{self.length}: their dimensions are reversed",
+                "write them transposed, with the pulses first",
+            )
+        if n is not None:
+            self._choose(file.rows, n)
         self._sample(file.dt_ns)
         self._calibrate(file.energy, file.kev_per_adc)
-        if self.t0 is not None and (t0_ns := self.t0.to("ns")) is not None:
-            self.of_each["t0_ns"] = np.broadcast_to(t0_ns, (self.n_pulses or 0,))
+        t0 = self.times.get("t0")
+        if t0 is not None and (by := factor(t0.units, "ns")) is not None:
+            self.of_each["t0_ns"] = np.broadcast_to(by * t0.values, (self.n_pulses or 0,))
         if name := next((name for name in EVENT_KEYS[:-1] if name in self.columns), None):
             self.of_each["event_number"] = self._of_each(name, self.columns[name])
         return self
@@ -224,10 +328,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
                 raise CpunetError(
                     f"{self.path}: no {name} {value}; it holds {shortened(np.unique(values))}"
                 )
-        dividers = [name for name in whole if divides(name) and name not in wanted]
-        of = {name: np.atleast_1d(whole[name].values)[rows] for name in dividers}
-        if names := dividing(of, len(rows)):
-            channels = list(np.unique(labels(of, names)))
+        names, channels = parts({n: c for n, c in whole.items() if n not in wanted}, rows)
+        if channels:
             also = ", or all for each" if self.format in ("LH5", "HDF5") else ""
             raise CpunetError(
                 f"{self.path}: one table of {len(channels)} channels or detectors "
@@ -240,7 +342,7 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         self.chosen, self.n_all, self.n_pulses = rows, n, len(rows)
         self.rows = partial(some_of, self.rows, rows)
         self.columns = {name: column.at(rows, n) for name, column in self.columns.items()}
-        self.period, self.t0 = (c and c.at(rows, n) for c in (self.period, self.t0))
+        self.times = {name: column.at(rows, n) for name, column in self.times.items()}
 
     def _sample(self, dt_ns: float | None) -> None:
         """Take the period from the column of the file or from the user.
@@ -248,18 +350,21 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         A column without units is not used, and ``dt_ns`` is required.  A file that says
         another period than the user is corrected, with a warning.
         """
-        name, column = self.period_name, self.period
-        periods = None if column is None else column.to("ns")
-        if column is None or periods is None:
+        of = self.times if "dt" in self.times else self.columns
+        name = "dt_ns" if "dt_ns" in of else "dt"
+        column = of.get(name)
+        units = "" if column is None else column.units or ("ns" if name == "dt_ns" else "")
+        if column is None or (by := factor(units, "ns")) is None:
             why = "is not in the file" if column is None else f"({name}) has no units"
-            if column is not None and column.units:
-                why = f"({name}) is in {column.units!r}, not in one of {unit_names('ns')}"
+            if units:
+                why = f"({name}) is in {units!r}, not in one of {unit_names('ns')}"
             if dt_ns is None:
                 raise CpunetError(f"{self.path}: the sampling period {why}; give `dt_ns`")
             self.dt_ns = dt_ns
             return
         if column.size != 1:
             self._of_each(name, column)
+        periods = by * np.asarray(column.values, np.float64)
         self.dt_ns = period = float(periods.flat[0])
         is_period = np.isfinite(period) and period > 0
         if dt_ns is None and not is_period:
@@ -285,41 +390,43 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         column, or ``FILE:path/to/column``.  Energies in units that are wrong or a little off
         are multiplied by ``kev_per_adc`` as well, with a warning.
         """
-        self.kev_per_adc, why = kev_per_adc, ""
-        if name := energy or next((name for name in _USUAL if name in self.columns), ""):
-            if (column := self.columns.get(name)) is None:
-                if ":" not in name:
-                    raise CpunetError(
-                        f"{self.path}: no column {name} for the energy; there are "
-                        f"{shortened(self.columns)}"
-                    )
-                from cpunet.pulses.reading import hdf5  # which other formats do not need
-
-                column = hdf5.column_elsewhere(self, name)
-            units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
-            by, rule = factor(units, "keV"), f"column {name} [{units}]"
-            if by is None and kev_per_adc is not None:
-                by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
-            elif by is not None and kev_per_adc is not None:
-                log.warning(
-                    f"{self.path.name}: column {name} is in {units}; its energies are "
-                    f"multiplied by {kev_per_adc:g}, as given (`kev_per_adc`)"
-                )
-                by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
-            if by is not None:
-                values = np.asarray(self._of_each(name, column), np.float64)
-                self.energies, self.of_each["energy_kev"] = rule, by * values
-                return
-            if energy is not None:
-                units = f"in {column.units}" if column.units else "without units"
-                raise CpunetError(
-                    f"{self.path}: column {name} is {units}, no energy in keV; "
-                    "add `kev_per_adc` (1 if it is in keV)"
-                )
-            why = f" (column {name} is not in energy units)"
-        self.energies = f"not known{why}"
+        self.kev_per_adc, self.energies = kev_per_adc, "not known"
         if kev_per_adc is not None:
             self.energies = f"amplitude x {kev_per_adc:g} keV/ADC"
+        name = energy or next((name for name in _USUAL if name in self.columns), None)
+        if name is None:
+            return
+        column = self.columns.get(name)
+        if column is None and ":" in name:
+            from cpunet.pulses.reading import hdf5  # which other formats do not need
+
+            column = hdf5.column_elsewhere(self, name)
+        if column is None:
+            raise CpunetError(
+                f"{self.path}: no column {name} for the energy; there are "
+                f"{shortened(self.columns)}"
+            )
+        units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
+        by, rule = factor(units, "keV"), f"column {name} [{units}]"
+        if by is not None and kev_per_adc is not None:
+            log.warning(
+                f"{self.path.name}: column {name} is in {units}; its energies are "
+                f"multiplied by {kev_per_adc:g}, as given (`kev_per_adc`)"
+            )
+            by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
+        elif kev_per_adc is not None:
+            by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
+        if by is not None:
+            values = np.asarray(self._of_each(name, column), np.float64)
+            self.energies, self.of_each["energy_kev"] = rule, by * values
+        elif energy is None:
+            self.energies = f"not known (column {name} is not in energy units)"
+        else:
+            units = f"in {column.units}" if column.units else "without units"
+            raise CpunetError(
+                f"{self.path}: column {name} is {units}, no energy in keV; "
+                "add `kev_per_adc` (1 if it is in keV)"
+            )
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -360,15 +467,13 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         """Traces with their energies, numbers and times."""
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(traces, np.float32)
-        n, stop = len(waveforms), start + len(waveforms)
-        of_each = {name: values[start:stop] for name, values in self.of_each.items()}
-        numbers = of_each.get("event_number", np.arange(start, stop))
-        if self.numbers is not None:
-            numbers = self.numbers(start, stop)
-        energy_kev = of_each.get("energy_kev", np.full(n, np.nan))
-        if "energy_kev" not in of_each and self.kev_per_adc is not None:
+        n = len(waveforms)
+        of_each = {name: values[start : start + n] for name, values in self.of_each.items()}
+        numbers = of_each.get("event_number", np.arange(start, start + n))
+        energy_kev = of_each.get("energy_kev")
+        if energy_kev is None and self.kev_per_adc is not None:
             energy_kev = self.kev_per_adc * amplitude(waveforms)
-        if len(energy_kev) != n:
+        if energy_kev is not None and len(energy_kev) != n:
             raise CpunetError(
                 f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
                 "give the energies of the same events"
@@ -383,10 +488,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
                 f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
                 "split the file by sampling period"
             )
+        t0_ns = of_each.get("t0_ns", 0.0)
         return Pulses.of(
-            waveforms,
-            dt_ns=self.dt_ns,
-            energy_kev=energy_kev,
-            event_number=event_number,
-            t0_ns=of_each.get("t0_ns", 0.0),
-        )
+            waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number,
+            t0_ns=t0_ns,
+        )  # fmt: skip
