@@ -14,7 +14,7 @@ MAX_BITS = 24  # of whole numbers in single precision
 
 @dataclass(frozen=True)
 class Adc:
-    """Raw traces in ADC counts, see `cpunet.translation.forms.Form`.
+    """Raw traces in ADC counts, see `cpunet.translation.file_translation`.
 
     Parameters
     ----------
