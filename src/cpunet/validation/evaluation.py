@@ -113,10 +113,10 @@ def evaluate(
     }
     survival, ranges = survivals(
         ae,
-        {peak.name: peak.moved[name] for peak in sets if peak.moved},
         amplitudes,
         energy_kev,
         lines | continua,
+        {peak.name: peak.moved[name] for peak in sets if peak.moved},
         seed,
     )
     tails = None if run.fit is None else run.fit.tails
