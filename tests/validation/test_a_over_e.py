@@ -8,7 +8,7 @@ from scipy.special import ndtr, ndtri
 
 from cpunet.validation.a_over_e import dep_cuts, range_survival, survivals
 from cpunet.validation.ae_energy import against_energy, site_fit
-from cpunet.validation.run_figures import ae_energy_figure, roc_figure
+from cpunet.validation.figures import ae_energy_figure, roc_figure
 
 SEP_MEAN = -1.0  # in widths of the DEP, whose cut at 90 % lies at -1.28
 SEP_SURVIVAL = 100 * ndtr(SEP_MEAN - ndtri(0.1))

@@ -16,8 +16,8 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.published import UNKNOWN
 from cpunet.training.run import Run
 from cpunet.training.train import train
-from cpunet.validation.drawings import drawings
 from cpunet.validation.evaluation import Evaluation, _compared, evaluate
+from cpunet.validation.figures import drawings
 from cpunet.validation.methods import pair_squares, scores_of_squares
 from cpunet.validation.validate import validate
 from synthetic import after_pole, decay, leave_undrawn, load_recipe, phased_edges, write_pulses
@@ -113,7 +113,7 @@ def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) 
 
 
 def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("cpunet.validation.drawings.drawings", lambda found: {})  # above
+    monkeypatch.setattr("cpunet.validation.figures.drawings", lambda found: {})  # above
     sides = files["sim"], files["no DEP"]
     report = validate(run, *sides, tmp_path / "report", baselines=False)
     metrics = report.metrics

@@ -27,8 +27,7 @@ from cpunet.training.job import TrainingJob
 from cpunet.training.run import resolve_device
 from cpunet.training.unfinished import differences
 from cpunet.translation.translator import REN
-from cpunet.validation.bootstraps import Resampled
-from cpunet.validation.comparisons import NULL_NODES, drawn_distances, wasserstein
+from cpunet.validation.comparisons import NULL_NODES, Resampled, drawn_distances, wasserstein
 from cpunet.validation.methods import like_data
 
 if TYPE_CHECKING:

@@ -125,7 +125,7 @@ def _validated(
 
         evaluation = evaluate(run, *pair, truth=truth, **how)
         # nor is matplotlib while the pulses take most memory
-        from cpunet.validation.drawings import drawings
+        from cpunet.validation.figures import drawings
 
         notes = _notes(run, truth)
         drawn = drawings(evaluation)
