@@ -16,10 +16,9 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.published import UNKNOWN
 from cpunet.training.run import Run
 from cpunet.training.train import train
-from cpunet.validation.evaluation import Evaluation, _compared, evaluate
 from cpunet.validation.figures import drawings
 from cpunet.validation.methods import pair_squares, scores_of_squares
-from cpunet.validation.validate import validate
+from cpunet.validation.validate import Evaluation, _compared, evaluate, validate
 from synthetic import after_pole, decay, leave_undrawn, load_recipe, phased_edges, write_pulses
 
 # more poles than these pulses have take long to be looked for

@@ -47,7 +47,7 @@ from cpunet.validation.noise import Spectrum
 from cpunet.validation.peaks import BEFORE_NS, MeanPulse, PeakSets, around_half, sliced
 
 if TYPE_CHECKING:
-    from cpunet.validation.evaluation import Evaluation
+    from cpunet.validation.validate import Evaluation
 
 AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is stated
