@@ -9,7 +9,7 @@ simulated pulse is therefore shown with the measured pulse nearest to its transl
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
@@ -42,7 +42,7 @@ from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import REFERENCE_KEV, Course, columns
 from cpunet.validation.comparisons import Compared, finite_values, histogram
-from cpunet.validation.metrics import QUANTITIES, Metrics
+from cpunet.validation.metrics import QUANTITIES, Metrics, PeakScores
 from cpunet.validation.noise import Spectrum
 from cpunet.validation.peaks import BEFORE_NS, MeanPulse, PeakSets, around_half, sliced
 
@@ -307,14 +307,13 @@ def shape_figure(
                 error = np.hypot(pulse.error, data.error) if data.n > 1 else np.array(0.01)
                 pull = (mean - data.mean) / np.where(error > 0, error, np.nan)
                 line(below, time_ns, pull, method)
-        most = max((pulse.n for method, pulse in pulses.items() if method != "data"), default=0)
-        counts = f"{data.n} measured, {most} simulated pulses"
-        if data.n > 1:
-            above.text(0.97, 0.03, counts, ha="right", transform=above.transAxes, size=8)
         above.set(title=name, xlim=(time_ns[0], time_ns[-1]))
         below.axhline(0, color="black", linewidth=0.8)
         below.set_xlabel("Time from half maximum [ns]")
         if data.n > 1:
+            most = max(pulse.n for method, pulse in pulses.items() if method != "data")
+            counts = f"{data.n} measured, {most} simulated pulses"
+            above.text(0.97, 0.03, counts, ha="right", transform=above.transAxes, size=8)
             sigma_panel(below)
             below.label_outer()
         else:  # a pulse alone has no error
@@ -462,22 +461,22 @@ def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
 def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
     """Functions that draw the figures of a validation, by name; they hold what they draw."""
     drawn: dict[str, Drawing] = {}
-    metrics = evaluated.metrics
+    metrics, run = evaluated.metrics, evaluated.run
     if metrics.held_out:
         drawn["overlap with data"] = partial(overlap_figure, metrics)
     if courses := metrics.ae_energy.methods:
         drawn["A over E and energy"] = partial(ae_energy_figure, courses)
     scored = [peak for peak in evaluated.sets if peak.values]
     for peak in scored:
-        of_peak = _of_peak(peak, evaluated)
-        drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak.items()}
+        of_peak = _of_peak(peak, metrics.peaks[peak.name])
+        drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak}
     ae = {p.name: {m: v["current_amplitude"] for m, v in p.values.items()} for p in scored}
     if DEP in ae and len(ae) > 1:
         drawn["A over E survival"] = partial(roc_figure, ae)
-    if any(name.startswith(f"{IREN.part}.") for name in evaluated.run.weights):
+    if any(name.startswith(f"{IREN.part}.") for name in run.weights):
         # pulses of both sides of the fullest peak through both networks and back
         fullest = max(evaluated.sets, key=lambda peak: min(map(len, peak.rows.values())))
-        iren, ren = evaluated.run.iren, fullest.translations.ren
+        iren, ren = run.iren, fullest.translations.ren
         for forward, back, side, names in (
             (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
             (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
@@ -487,17 +486,16 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
             middle = forward.apply(start, energy_kev=kev, noise=False)
             end = back.apply(middle, energy_kev=kev, noise=False)
             stages = dict(zip(names, (start, middle, end), strict=True))
-            draw = partial(cycle_figure, stages, ren.dt_ns)
-            drawn[f"{fullest.name} cycle of {names[0].lower()}"] = draw
-    if evaluated.run.records:
-        drawn["losses"] = partial(loss_curves, evaluated.run.records)
+            name = f"{fullest.name} cycle of {names[0].lower()}"
+            drawn[name] = partial(cycle_figure, stages, ren.dt_ns)
+    if run.records:
+        drawn["losses"] = partial(loss_curves, run.records)
     return drawn
 
 
-def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
-    name, dt_ns, bins = peak.name, evaluated.run.dt_ns, evaluated.run.recipe.scores.max_bins
-    scores, values = evaluated.metrics.peaks[name], peak.values
-    drawn: dict[str, Drawing] = {}
+def _of_peak(peak: PeakSets, scores: PeakScores) -> Iterator[tuple[str, Drawing]]:
+    ren, name, values = peak.translations.ren, peak.name, peak.values
+    dt_ns, bins = ren.dt_ns, ren.recipe.scores.max_bins
     further: dict[str, dict[str, Values]] = {}
     for parameter, data in values["data"].items():
         by_method = {m: v[parameter] for m, v in values.items()}
@@ -505,41 +503,32 @@ def _of_peak(peak: PeakSets, evaluated: Evaluation) -> dict[str, Drawing]:
             continue
         if parameter in scores.judged:
             how = (by_method, data_axis(data, bins), parameter, name, scores.judged[parameter])
-            drawn[parameter.replace("_", " ")] = partial(parameter_histograms, *how)
+            yield parameter.replace("_", " "), partial(parameter_histograms, *how)
         else:
             further[parameter] = by_method
-    drawn["further parameters"] = partial(further_histograms, further, bins, name)
+    yield "further parameters", partial(further_histograms, further, bins, name)
     rise_time = {method: v["rise_01_90"] for method, v in values.items()}
     edges, means = sliced(peak.windows, rise_time, dt_ns)
     whole = {"": {method: of_method[0] for method, of_method in means.items()}}
-    title = f"{name}: mean pulse"
-    drawn["mean pulse"] = partial(shape_figure, whole, dt_ns, title)
+    yield "mean pulse", partial(shape_figure, whole, dt_ns, f"{name}: mean pulse")
     columns = {
         f"{low:.0f} … {high:.0f} ns": {m: means[m][i] for m in SLICED if m in means}
         for i, (low, high) in enumerate(pairwise(edges), start=1)
     }
     title = f"{name}: superpulses in slices of rise time 1–90 %"
-    drawn["superpulses"] = partial(shape_figure, columns, dt_ns, title)
-    if (single := _single_pulse(peak)) is not None:
-        drawn["single pulse"] = single
-    if not scores.noise["data"].missing:
-        noise = {m: scores.noise[m] for m in ("data", "ren")}
-        drawn["noise"] = partial(spectrum_of_noise, noise, name)
-    return drawn
-
-
-def _single_pulse(peak: PeakSets) -> Drawing | None:
-    """The first simulated event with an edge in every method, with a measured pulse."""
-    dt_ns = peak.translations.ren.dt_ns
+    yield "superpulses", partial(shape_figure, columns, dt_ns, title)
     for row in peak.known_to_all():
         windows = peak.translations.without_noise(row)
         shapes = {m: around_half(windows[m], dt_ns)[0] for m in SINGLE if m in windows}
         if all(np.isfinite(shape).any() for shape in shapes.values()):
-            data = peak.windows("data")
-            place, rms = nearest(around_half(data, dt_ns), shapes["ren"])
-            shapes = {"data": around_half(data[[place]], dt_ns)[0]} | shapes
+            measured = around_half(peak.windows("data"), dt_ns)
+            place, rms = nearest(measured, shapes["ren"])
+            shapes = {"data": measured[place]} | shapes
             pulses = {m: MeanPulse(s, np.full(len(s), np.nan), 1) for m, s in shapes.items()}
-            title = f"{peak.name}: a simulated pulse without noise, and the measured pulse\n"
+            title = f"{name}: a simulated pulse without noise, and the measured pulse\n"
             title += f"nearest to its REN translation (RMS difference {rms:.4f})"
-            return partial(shape_figure, {"": pulses}, dt_ns, title)
-    return None
+            yield "single pulse", partial(shape_figure, {"": pulses}, dt_ns, title)
+            break
+    if not scores.noise["data"].missing:
+        noise = {m: scores.noise[m] for m in ("data", "ren")}
+        yield "noise", partial(spectrum_of_noise, noise, name)

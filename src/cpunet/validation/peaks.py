@@ -28,7 +28,6 @@ import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Self
 
 import numpy as np
@@ -243,9 +242,19 @@ def score_peak(
     compared = compare(values["data"], others, recipe.scores, seed, moved)
     result.parameters = {name: compared.pop(name) for name in PARAMETERS}
     result.further = compared
+
+    def classified(method: str) -> TwoSample | Missing:
+        both = ("data", method)
+        chief = [{n: values[m][n] for n in PARAMETERS} for m in both]
+        try:
+            return classifier_auc(
+                *map(peak.windows, both), seed=seed, features=(chief[0], chief[1])
+            )
+        except CpunetError as error:
+            return Missing(missing=str(error))
+
     with ThreadPoolExecutor(usable_cores()) as pool:
-        tests = pool.map(partial(classifier_test, peak, seed), methods)
-        result.two_sample = dict(zip(methods, tests, strict=True))
+        result.two_sample = dict(zip(methods, pool.map(classified, methods), strict=True))
     samples, before = recipe.preparation.baseline_samples, recipe.preparation.samples_before
     result.noise = baseline_spectra(
         {m: of_all.windows[m][rows, :samples] for m, rows in peak.rows.items()},
@@ -257,26 +266,6 @@ def score_peak(
         rows = peak.known_to_all()
         result.paired = {m: scores_of_squares(of[rows]) for m, of in of_all.squares.items()}
     return result
-
-
-def classifier_test(peak: PeakSets, seed: int, method: str) -> TwoSample | Missing:
-    """Classifier test between a method and the data by their pulses and chief parameters.
-
-    Parameters
-    ----------
-    peak
-        Pulses of the peak and their values.
-    seed
-        Seed of the folds.
-    method
-        Name of the method.
-    """
-    both = ("data", method)
-    data, own = ({n: peak.values[m][n] for n in PARAMETERS} for m in both)
-    try:
-        return classifier_auc(*map(peak.windows, both), seed=seed, features=(data, own))
-    except CpunetError as error:
-        return Missing(missing=str(error))
 
 
 def fit_ends(run: Run, ren: REN) -> Ends:
