@@ -70,9 +70,8 @@ def test_table_of_a_method_that_agrees_and_one_that_does_not():
     assert not table["DEP"].survival
     assert not sep.cut
     assert table["DEP"].cut["good"] == pytest.approx(0.9 * (10 + ndtri(0.1)), abs=0.1)
-    # all survive on one side and none on the other, which no division at random changes
-    far = {"data": peaks(rng) | {"SEP": np.full(9, 99.0)}, "ren": peaks(rng)}
-    far["ren"]["SEP"] = np.full(9, 99.0)
+    # all of both survive, which no division at random changes
+    far = {m: peaks(rng) | {"SEP": np.full(9, 99.0)} for m in ("data", "ren")}
     row = survival_table(**far)["SEP"]
     assert (row.difference["ren"], row.sigma["ren"]) == (0, 0)
     assert row.difference_std["ren"] > 5
@@ -107,20 +106,19 @@ def test_a_line_has_the_error_of_its_background_and_that_of_the_fit():
     amplitudes = {m: np.r_[of["SEP"], below] for m, of in sets.items()}
     kev = dict.fromkeys(sets, np.r_[np.full(2000, 2103.0), rng.uniform(2060, 2090, 1500)])
     bands = {"SEP": ((2098.0, 2108.0), [(2060.0, 2090.0)])}
-    # the end of an axis lowers the escape peak only, and so what survives
-    moved = {"DEP": ae["DEP"]["ren"] + np.zeros((1, 2, 1)), "SEP": ae["SEP"]["ren"]}
-    moved["SEP"] = moved["SEP"] + np.array([0.1, -0.1])[:, np.newaxis]
-    moved["SEP"] = moved["SEP"][np.newaxis]
+    # both ends of the only axis move the escape peak, and so what survives
+    by = {"DEP": np.zeros((1, 2, 1)), "SEP": np.array([0.1, -0.1]).reshape(1, 2, 1)}
+    moved = {peak: ae[peak]["ren"] + shift for peak, shift in by.items()}
     plain, fit, line, both = (
         survivals(ae, amplitudes, kev, of, ends)[0]["SEP"]
         for of in ({}, bands)
         for ends in ({}, moved)
     )
     assert fit.of_fit == pytest.approx(100 * 0.1 * 0.38, rel=0.1)
-    for without, having in ((plain, fit), (line, both)):
-        for error, row in ((without.difference_std, having.difference_std),
-                           (without.survival_std, having.survival_std)):  # fmt: skip
-            assert row["ren"] == pytest.approx(np.hypot(error["ren"], fit.of_fit))
+    for name in ("difference_std", "survival_std"):
+        for without, row in ((plain, fit), (line, both)):
+            error = np.hypot(getattr(without, name)["ren"], fit.of_fit)
+            assert getattr(row, name)["ren"] == pytest.approx(error)
     assert line.difference_std["ren"] > plain.difference_std["ren"]
     assert line.events == {"data": 2000, "ren": 2000}
 
@@ -158,13 +156,10 @@ def test_survival_of_a_line_is_that_of_its_own_events():
     assert of_line.peak == in_peak.sum()
     assert of_line.peak_pass == (amplitude[in_peak] >= table["DEP"].cut["data"]).sum()
 
-
-@pytest.mark.parametrize("background", [[], [0.5]])
-def test_no_error_is_zero_where_all_or_none_survive(background):
-    for cut in (0.0, 2.0):
-        of = range_survival(np.ones(8), np.full(3, cut), np.array(background), 0.0)
-        assert 5 < of.survival_std < 15
-        assert 5 < range_survival(np.ones(8), np.full(3, cut), np.empty(0), 1).survival_std < 15
+    # no error is zero where all or none survive, with sidebands without events or none
+    for cut, scale in ((0.0, 0.0), (2.0, 0.0), (0.0, 1.0), (2.0, 1.0)):
+        few = range_survival(np.ones(8), np.full(3, cut), scale=scale)
+        assert 5 < few.survival_std < 15
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,8 @@ from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.validation.figures import drawings
 from cpunet.validation.methods import pair_squares, scores_of_squares
+from cpunet.validation.metrics import ALARM
+from cpunet.validation.peaks import classifier_excess, fit_ends
 from cpunet.validation.validate import Evaluation, _compared, evaluate, validate
 from synthetic import after_pole, decay, leave_undrawn, load_recipe, phased_edges, write_pulses
 
@@ -158,6 +160,27 @@ def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     how = {"energy_kev": of.energy_kev["raw"], "generator": np.random.default_rng(0)}
     again = of.ren.apply(of.windows["raw"], **how)
     np.testing.assert_array_equal(pulses["ren"], again[raw])
+
+
+def test_errors_of_the_fit_are_in_the_p_of_the_classifier(run, found):
+    peak, excess = found.sets[0], {}
+    for factor in (0, 1, 900):
+        covariance = (factor * np.array(run.fit.covariance)).tolist()
+        fit = run.fit.model_copy(update={"covariance": covariance})
+        ends = fit_ends(run.model_copy(update={"fit": fit}), peak.translations.ren)
+        excess[factor] = classifier_excess(peak, ends, seed=0)
+    assert excess[0] == 0
+    assert excess[1] < 0.05 < excess[900]
+    scored = found.metrics.peaks["FEP"].two_sample["ren"]
+    assert scored.of_fit == excess[1]
+    metrics, p = found.metrics.model_copy(deep=True), []
+    for of_fit in (0.0, 0.05):
+        for auc in (scored.null_mean + 0.1, 0.95):
+            tested = dataclasses.replace(scored, auc=auc, null_std=0.02, of_fit=of_fit)
+            metrics.peaks["FEP"].two_sample["ren"] = tested
+            p.append(metrics.judge("FEP", "ren")["auc"].p)
+    assert p[0] < ALARM < p[2]
+    assert max(p[1], p[3]) < ALARM
 
 
 @pytest.fixture(scope="module")

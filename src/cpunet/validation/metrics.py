@@ -2,8 +2,8 @@
 
 There is a p-value for each quantity, and words.  Each p-value is the probability that two
 samples of one distribution differ by more.  It contains the sampling of both sides and, of a
-REN with a covariance, the errors of the fit; that of the classifier contains the sampling
-alone.  What is less likely than `ALARM`, three standard deviations, is off.
+REN with a covariance, the errors of the fit.  What is less likely than `ALARM`, three standard
+deviations, is off.
 ``benchmarks/p_values.py`` shows that p is uniform where nothing is wrong.
 
 An agreement says no more than its sensitivity: the difference is quoted with its error.
@@ -251,9 +251,13 @@ class Metrics(Result):
         if isinstance(tested, Missing):
             verdicts[_AUC] = Verdict(None, reason=tested.missing)
         elif tested is not None:
-            null, std = tested.null_mean, tested.null_std
+            # the errors of a fit raise the AUC by so much, with a spread as large
+            null, std = (
+                tested.null_mean + tested.of_fit,
+                math.hypot(tested.null_std, tested.of_fit),
+            )
             more, p = tested.auc - null, None
-            if std:
+            if tested.null_std:
                 p = stdtr(SHUFFLES - 1, -more / (std * math.sqrt(1 + 1 / SHUFFLES)))
             words = f"AUC {with_std(tested.auc, std)}, {null:.2f} expected"
             data = with_std(null, std)

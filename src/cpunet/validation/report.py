@@ -150,16 +150,15 @@ class Report:
 
         index = ["peak", "parameter", "method"]
         columns = [*index, "iou", "iou_std", "ceiling", "wasserstein"]
-        rows = []
-        for peak, scores in self.metrics.peaks.items():
-            for parameter, of in scores.parameters.items():
-                for method in (method for method in of.iou if method != "ceiling"):
-                    score, error, w1 = (
-                        by.get(method) for by in (of.iou, of.iou_std, of.wasserstein)
-                    )
-                    rows.append(
-                        [peak, parameter, method, score, error, of.iou.get("ceiling"), w1]
-                    )
+        rows = [
+            [peak, parameter, method]
+            + [by.get(method) for by in (of.iou, of.iou_std)]
+            + [of.iou.get("ceiling"), of.wasserstein.get(method)]
+            for peak, scores in self.metrics.peaks.items()
+            for parameter, of in scores.parameters.items()
+            for method in of.iou
+            if method != "ceiling"
+        ]
         return DataFrame(rows, columns=columns).set_index(index)
 
     def __getitem__(self, peak: str) -> DataFrame:
