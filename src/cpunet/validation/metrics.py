@@ -32,6 +32,7 @@ from cpunet.validation.noise import Spectrum
 ALARM = 2.7e-3  # p of three standard deviations
 SAME = 3e-5  # 1 - p of samples that agree too well
 SMALLEST = 1e-12  # p that is stated
+QUANTILE_SLOPE = math.sqrt(2 * math.pi)  # of the normal quantile at one half
 NAMED = 3  # quantities that a headline names
 WRITTEN = ("p", "sigma", "numbers", "words")  # of a verdict
 
@@ -251,14 +252,18 @@ class Metrics(Result):
         if isinstance(tested, Missing):
             verdicts[_AUC] = Verdict(None, reason=tested.missing)
         elif tested is not None:
-            # the errors of a fit raise the AUC by so much, with a spread as large
-            null, std = (
-                tested.null_mean + tested.of_fit,
-                math.hypot(tested.null_std, tested.of_fit),
+            # the errors of a fit raise the AUC by so much, with a spread as large; on the scale
+            # of the normal quantile separations add, and an AUC of 1 is infinitely far
+            null, std, p = tested.null_mean + tested.of_fit, tested.null_std, None
+            place, expected, least = (
+                ndtri((tested.auc, null, tested.null_mean)) / QUANTILE_SLOPE
             )
-            more, p = tested.auc - null, None
-            if tested.null_std:
-                p = stdtr(SHUFFLES - 1, -more / (std * math.sqrt(1 + 1 / SHUFFLES)))
+            if std:
+                spread = math.hypot(std, expected - least)
+                p = stdtr(
+                    SHUFFLES - 1, (expected - place) / (spread * math.sqrt(1 + 1 / SHUFFLES))
+                )
+            more, std = tested.auc - null, math.hypot(std, tested.of_fit)
             words = f"AUC {with_std(tested.auc, std)}, {null:.2f} expected"
             data = with_std(null, std)
             verdicts[_AUC] = Verdict(p and float(p), words, "no value", (more, std), data)
