@@ -119,7 +119,6 @@ def dep_cuts(dep_ae: Values, rng: np.random.Generator, bootstraps: int = BOOTSTR
     if dep.size < MIN_EVENTS:
         return np.full(1 + bootstraps, np.nan)
     samples = np.vstack([dep, rng.choice(dep, (bootstraps, dep.size))])
-    # for this quantile the acceptance of new events is exact on average for any sample size
     return np.asarray(np.quantile(samples, 1 - ACCEPTANCE, axis=1, method="weibull"))
 
 
@@ -156,9 +155,9 @@ def range_survival(
     >>> round(float(cuts[0]), 6), round(range_survival(ae, cuts).survival, 2)
     (10.0, 90.91)
     """
-    inside, beside = (np.sort(finite_values(values)) for values in (events, background))
-    n, n_side = len(inside), len(beside)
-    passing, side_pass = (len(v) - np.searchsorted(v, cuts) for v in (inside, beside))
+    inside, sides = (np.sort(finite_values(values)) for values in (events, background))
+    n, n_side = len(inside), len(sides)
+    passing, side_pass = (len(v) - np.searchsorted(v, cuts) for v in (inside, sides))
     p, s, total = int(passing[0]), int(side_pass[0]), n - scale * n_side
     result = RangeSurvival(
         peak=n,
