@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from pydantic import Field
 from scipy.special import ndtr, ndtri, stdtr
 
@@ -32,6 +33,7 @@ from cpunet.validation.noise import Spectrum
 ALARM = 2.7e-3  # p of three standard deviations
 SAME = 3e-5  # 1 - p of samples that agree too well
 SMALLEST = 1e-12  # p that is stated
+LEAST_AUC = 1e-3  # and most: beyond, quantiles diverge
 QUANTILE_SLOPE = math.sqrt(2 * math.pi)  # of the normal quantile at one half
 NAMED = 3  # quantities that a headline names
 WRITTEN = ("p", "sigma", "numbers", "words")  # of a verdict
@@ -253,7 +255,7 @@ class Metrics(Result):
             verdicts[_AUC] = Verdict(None, reason=tested.missing)
         elif tested is not None:
             # the errors of a fit raise the AUC by so much, with a spread as large; on the scale
-            # of the normal quantile separations add, and an AUC of 1 is infinitely far
+            # of the normal quantile separations add
             null, std, p = tested.null_mean + tested.of_fit, tested.null_std, None
             place, expected, least = (
                 ndtri((tested.auc, null, tested.null_mean)) / QUANTILE_SLOPE
