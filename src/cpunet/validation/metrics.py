@@ -257,9 +257,8 @@ class Metrics(Result):
             # the errors of a fit raise the AUC by so much, with a spread as large; on the scale
             # of the normal quantile separations add
             null, std, p = tested.null_mean + tested.of_fit, tested.null_std, None
-            place, expected, least = (
-                ndtri((tested.auc, null, tested.null_mean)) / QUANTILE_SLOPE
-            )
+            aucs = np.clip((tested.auc, null, tested.null_mean), LEAST_AUC, 1 - LEAST_AUC)
+            place, expected, least = ndtri(aucs) / QUANTILE_SLOPE
             if std:
                 spread = math.hypot(std, expected - least)
                 p = stdtr(
