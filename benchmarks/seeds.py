@@ -27,8 +27,8 @@ from cpunet.recipes import load_recipe
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.validation.comparisons import Missing
-from cpunet.validation.evaluation import evaluate
 from cpunet.validation.metrics import Metrics
+from cpunet.validation.validate import evaluate
 
 FAILED = 0.9
 FAR = 1000  # between the seeds of draws of noise

@@ -31,8 +31,8 @@ from cpunet.training.network_runs import generators, settle
 from cpunet.training.run import Run, versions
 from cpunet.training.views import Side
 from cpunet.validation.comparisons import Missing
-from cpunet.validation.evaluation import evaluate
 from cpunet.validation.methods import true_responses
+from cpunet.validation.validate import evaluate
 
 PEAK = "FEP"
 REPORTS = 10

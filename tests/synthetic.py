@@ -12,6 +12,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -39,7 +40,6 @@ from cpunet.pulses.writing import Columns, PulseWriter
 from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.training.adversarial import Game
 from cpunet.training.run import Run
-from cpunet.validation import page
 from cpunet.validation.methods import pair_squares, scores_of_squares, true_responses
 from cpunet.validation.metrics import Metrics, PairedScores
 from cpunet.validation.report import Report
@@ -386,11 +386,12 @@ def interrupted_in(iteration: int) -> Iterator[None]:
 def leave_undrawn(patch: pytest.MonkeyPatch) -> None:
     """Leave the figures of reports empty."""
 
-    def write_page(folder: Path, metrics: Any, figures: Any, notes: Any) -> None:
-        write(folder, metrics, dict.fromkeys(figures, Figure), notes)
+    write = Report.write
 
-    write = page.write_page
-    patch.setattr(page, "write_page", write_page)
+    def write_undrawn(report: Report, folder: Path) -> None:
+        write(replace(report, drawn=dict.fromkeys(report.drawn or (), Figure)), folder)
+
+    patch.setattr(Report, "write", write_undrawn)
 
 
 def write_report(

@@ -10,7 +10,6 @@ import numpy.typing as npt
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.container import Container
     from matplotlib.figure import Figure
 
 P = ParamSpec("P")
@@ -90,10 +89,11 @@ def line(axes: Axes, x: Any, y: Any, method: str, text: str | None = None) -> No
     axes.plot(x, y, label=text, color=COLOURS[method], linewidth=width, gid=GROUP + method)
 
 
-def group(drawn: Container, method: str) -> None:
-    """Mark points with errors as those of a method, by which a page hides them."""
+def points(axes: Axes, x: Any, y: Any, error: Any, method: str, **look: Any) -> None:
+    """Draw points with errors of a method, as `Axes.errorbar` says."""
+    drawn = axes.errorbar(x, y, error, color=COLOURS[method], marker="o", **look)
     for artist in drawn.get_children():
-        artist.set_gid(GROUP + method)
+        artist.set_gid(GROUP + method)  # by which a page hides them
 
 
 def panels(

@@ -46,6 +46,20 @@ def test_equal_distributions_cannot_be_told_apart():
     assert np.mean([abs(r.auc - 0.5) < 2 * r.auc_std for r in results]) > 0.85
 
 
+def test_the_same_events_with_other_noise_are_no_difference():
+    """Each is in one fold on both sides: trained on with one label, it would get the other."""
+    rng = np.random.default_rng(2)
+    pulses = windows(rng, 200)
+    one, other = (pulses + rng.normal(0, 0.01, pulses.shape) for _ in range(2))
+    other[3] = np.nan
+    assert classifier_auc(one, other, seed=0).auc < 0.42
+    alike = classifier_auc(one, other, seed=0, same_events=True)
+    assert alike.auc == pytest.approx(0.5, abs=0.06)
+    assert alike.n_data == alike.n_sim == 199
+    moved = classifier_auc(one, other + SHAPE, seed=0, same_events=True)
+    assert moved.auc == pytest.approx(ndtr(1 / np.sqrt(2)), abs=0.1)
+
+
 @pytest.mark.parametrize("shift", [0.5, 1.0, 2.0])
 def test_a_shift_has_the_analytic_auc(shift):
     rng = np.random.default_rng(1)

@@ -12,7 +12,7 @@ from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.export import export_onnx
 from cpunet.translation.translator import IREN, REN
-from cpunet.validation.run_figures import loss_curves
+from cpunet.validation.figures import loss_curves
 from games import SMALL
 from synthetic import (
     load_recipe,

@@ -6,15 +6,9 @@ import numpy as np
 import pytest
 from scipy.special import ndtr, ndtri
 
-from cpunet.validation.a_over_e import (
-    SurvivalRow,
-    ae_survival,
-    peak_survival,
-    sideband_survival,
-    survival_table,
-)
+from cpunet.validation.a_over_e import dep_cuts, range_survival, survivals
 from cpunet.validation.ae_energy import against_energy, site_fit
-from cpunet.validation.run_figures import ae_energy_figure, roc_figure
+from cpunet.validation.figures import ae_energy_figure, roc_figure
 
 SEP_MEAN = -1.0  # in widths of the DEP, whose cut at 90 % lies at -1.28
 SEP_SURVIVAL = 100 * ndtr(SEP_MEAN - ndtri(0.1))
@@ -27,15 +21,17 @@ def peaks(rng, n_dep=800, n_sep=1000, scale=1.0):
     }
 
 
-def by_peak(**sets):
-    """A/E by peak and method, of sets by method and peak."""
-    return {peak: {m: of_set[peak] for m, of_set in sets.items()} for peak in sets["data"]}
+def survival_table(energies=None, bands=None, **sets):
+    """Survival by peak, of A/E of sets by method and peak, and of bands if there are some."""
+    by_peak = {peak: {m: of_set[peak] for m, of_set in sets.items()} for peak in sets["data"]}
+    amplitudes = {m: np.concatenate([*of_set.values()]) for m, of_set in sets.items()}
+    return survivals(by_peak, amplitudes, energies or {}, bands or {})[0]
 
 
 @pytest.mark.parametrize("n_dep", [20, 24, 61])
 def test_new_events_survive_with_the_acceptance_however_few_set_the_cut(n_dep):
     rng = np.random.default_rng(1)
-    cuts = [ae_survival(rng.random(n_dep), {}, bootstraps=2)[0] for _ in range(1500)]
+    cuts = [dep_cuts(rng.random(n_dep), rng, bootstraps=1)[0] for _ in range(1500)]
     assert 1 - np.mean(cuts) == pytest.approx(0.9, abs=0.006)
 
 
@@ -43,15 +39,16 @@ def test_new_events_survive_with_the_acceptance_however_few_set_the_cut(n_dep):
 def test_errors_cover_the_truth(n_dep, n_sep):
     """The error of the cut dominates in the first case, the counts in the second."""
     rng = np.random.default_rng(2)
-    found = []
+    results = []
     for _ in range(250):
         sample = peaks(rng, n_dep, n_sep)
-        cut, cut_std, survived = ae_survival(sample.pop("DEP"), sample, bootstraps=40, seed=rng)
-        found.append((*survived["SEP"], cut, cut_std))
-    survivals, stds, cuts, cut_stds = np.array(found).T
-    assert np.std(survivals) == pytest.approx(np.mean(stds), rel=0.15)
+        cuts = dep_cuts(sample["DEP"], rng, bootstraps=40)
+        of = range_survival(sample["SEP"], cuts)
+        results.append((of.survival, of.survival_std, cuts[0], cuts[1:].std()))
+    survival, stds, cuts, cut_stds = np.array(results).T
+    assert np.std(survival) == pytest.approx(np.mean(stds), rel=0.15)
     assert np.std(cuts) == pytest.approx(np.mean(cut_stds), rel=0.15)
-    within = np.abs(survivals - SEP_SURVIVAL) < 2 * stds
+    within = np.abs(survival - SEP_SURVIVAL) < 2 * stds
     assert 0.91 < within.mean() < 0.99
 
 
@@ -60,7 +57,7 @@ def test_table_of_a_method_that_agrees_and_one_that_does_not():
     # the scale of A/E is another: each set has its own cut, and it must not matter
     good = peaks(rng, 3000, 3000, scale=0.9)
     bad = peaks(rng, 3000, 3000) | {"SEP": rng.normal(10, 1, 3000)}
-    table = survival_table(by_peak(data=peaks(rng, 3000, 3000), good=good, bad=bad))
+    table = survival_table(data=peaks(rng, 3000, 3000), good=good, bad=bad)
     sep = table["SEP"]
     assert sep.survival["data"] == pytest.approx(SEP_SURVIVAL, abs=4)
     assert abs(sep.sigma["good"]) < 3
@@ -73,6 +70,11 @@ def test_table_of_a_method_that_agrees_and_one_that_does_not():
     assert not table["DEP"].survival
     assert not sep.cut
     assert table["DEP"].cut["good"] == pytest.approx(0.9 * (10 + ndtri(0.1)), abs=0.1)
+    # all of both survive, which no division at random changes
+    far = {m: peaks(rng) | {"SEP": np.full(9, 99.0)} for m in ("data", "ren")}
+    row = survival_table(**far)["SEP"]
+    assert (row.difference["ren"], row.sigma["ren"]) == (0, 0)
+    assert row.difference_std["ren"] > 5
 
 
 def test_table_says_what_does_not_exist():
@@ -80,7 +82,7 @@ def test_table_says_what_does_not_exist():
     data = peaks(rng) | {"FEP": np.array([])}
     data["DEP"] = np.r_[data["DEP"], np.inf, np.nan]
     few = peaks(rng, n_dep=5) | {"FEP": np.array([9.0, np.nan])}
-    table = survival_table(by_peak(data=data, few=few))
+    table = survival_table(data=data, few=few)
     assert table["DEP"].events == {"data": 800, "few": 5}
     assert table["DEP"].missing == {"data": 2, "few": 0}
     assert table["DEP"].cut["few"] is None
@@ -90,20 +92,49 @@ def test_table_says_what_does_not_exist():
     assert table["FEP"].events == {"data": 0, "few": 1}
     assert table["FEP"].missing == {"data": 0, "few": 1}
     assert set(table["FEP"].survival.values()) == {None}
-    assert "lack peak DEP" in survival_table({"SEP": {"data": data["SEP"]}}).missing
+    both = survivals({"SEP": {"data": data["SEP"]}}, {}, {}, {})
+    assert "lack peak DEP" in both[0].missing
+    assert "no A/E cut" in both[1].missing
+
+
+def test_a_line_has_the_error_of_its_background_and_that_of_the_fit():
+    """Both are added to the error of a peak without them."""
+    rng = np.random.default_rng(10)
+    sets = {m: peaks(rng, 2000, 2000) for m in ("data", "ren")}
+    ae = {peak: {m: of[peak] for m, of in sets.items()} for peak in ("DEP", "SEP")}
+    below = rng.normal(9, 1, 1500)
+    amplitudes = {m: np.r_[of["SEP"], below] for m, of in sets.items()}
+    kev = dict.fromkeys(sets, np.r_[np.full(2000, 2103.0), rng.uniform(2060, 2090, 1500)])
+    bands = {"SEP": ((2098.0, 2108.0), [(2060.0, 2090.0)])}
+    # both ends of the only axis move the escape peak, and so what survives
+    by = {"DEP": np.zeros((1, 2, 1)), "SEP": np.array([0.1, -0.1]).reshape(1, 2, 1)}
+    moved = {peak: ae[peak]["ren"] + shift for peak, shift in by.items()}
+    plain, fit, line, both = (
+        survivals(ae, amplitudes, kev, of, ends)[0]["SEP"]
+        for of in ({}, bands)
+        for ends in ({}, moved)
+    )
+    assert fit.of_fit == pytest.approx(100 * 0.1 * 0.38, rel=0.1)
+    for name in ("difference_std", "survival_std"):
+        for without, row in ((plain, fit), (line, both)):
+            error = np.hypot(getattr(without, name)["ren"], fit.of_fit)
+            assert getattr(row, name)["ren"] == pytest.approx(error)
+    assert line.difference_std["ren"] > plain.difference_std["ren"]
+    assert line.events == {"data": 2000, "ren": 2000}
 
 
 def test_sideband_error_is_the_spread_over_repeated_experiments():
     rng = np.random.default_rng(9)
     results = []
     for _ in range(4000):
-        signal, below, beside = rng.poisson([400, 150, 450])
-        passing = rng.binomial(signal, 0.6) + rng.binomial(below, 0.2)
-        side_pass = rng.binomial(beside, 0.2)
-        results.append(sideband_survival(passing, signal + below, side_pass, beside, 1 / 3))
-    survivals, stds = np.array(results).T
-    assert survivals.mean() == pytest.approx(60, abs=0.3)
-    assert survivals.std() == pytest.approx(stds.mean(), rel=0.05)
+        signal, below, n_side = rng.poisson([400, 150, 450])
+        survive = rng.random(signal + below) < np.repeat([0.6, 0.2], [signal, below])
+        sides = rng.random(n_side) < 0.2
+        of = range_survival(1.0 * survive, np.full(3, 0.5), 1.0 * sides, 1 / 3)
+        results.append((of.survival, of.survival_std))
+    survival, stds = np.array(results).T
+    assert survival.mean() == pytest.approx(60, abs=0.3)
+    assert survival.std() == pytest.approx(stds.mean(), rel=0.05)
 
 
 def test_survival_of_a_line_is_that_of_its_own_events():
@@ -112,34 +143,37 @@ def test_survival_of_a_line_is_that_of_its_own_events():
     energy = np.r_[rng.normal(2103.5, 1, n_line), rng.uniform(2050, 2150, n_flat)]
     amplitude = np.r_[rng.random(n_line) + 0.2, rng.random(n_flat)]
     amplitude[:10] = np.nan
-    found = peak_survival(
-        amplitude, energy, 0.7, (2098.5, 2108.5), [(2060, 2090), (2117, 2147)]
+    dep = np.linspace(0.7 - 0.01, 0.7 + 0.09, 2001)  # whose cut lies at 0.7
+    bands = {"SEP": ((2098.5, 2108.5), [(2060, 2090), (2117, 2147)])}
+    table, ranges = survivals(
+        {"DEP": {"data": dep}}, {"data": amplitude}, {"data": energy}, bands
     )
-    assert found.survival == pytest.approx(50, abs=1)
-    assert found.scale == pytest.approx(10 / 60)
-    assert found.undefined == 10
+    of_line = ranges["SEP"]["data"]
+    assert of_line.survival == table["SEP"].survival["data"] == pytest.approx(50, abs=1)
+    assert of_line.scale == pytest.approx(10 / 60)
+    assert of_line.undefined == 10
     in_peak = (energy >= 2098.5) & (energy < 2108.5) & np.isfinite(amplitude)
-    assert found.peak == in_peak.sum()
-    assert found.peak_pass == (amplitude[in_peak] >= 0.7).sum()
+    assert of_line.peak == in_peak.sum()
+    assert of_line.peak_pass == (amplitude[in_peak] >= table["DEP"].cut["data"]).sum()
+
     # no error is zero where all or none survive, with sidebands without events or none
-    for cut, sidebands in ((0.0, []), (2.0, []), (0.0, [(1990, 2000)]), (2.0, [(1990, 2000)])):
-        few = peak_survival(np.ones(8), np.full(8, 2039.0), cut, (2004, 2074), sidebands)
+    for cut, scale in ((0.0, 0.0), (2.0, 0.0), (0.0, 1.0), (2.0, 1.0)):
+        few = range_survival(np.ones(8), np.full(3, cut), scale=scale)
         assert 5 < few.survival_std < 15
 
 
 @pytest.mark.parametrize(
-    ("cut", "peak", "sidebands", "reason"),
+    ("cut", "n", "background", "reason"),
     [
-        (0.5, (100, 110), [], "no events from 100 to 110 keV"),
-        (np.nan, (2000, 2010), [], "there is no cut"),
-        (0.5, (2000, 2010), [(2010, 2012)], "the sidebands leave no events of 3"),
+        (0.5, 0, 0, "no events"),
+        (np.nan, 3, 0, "there is no cut"),
+        (0.5, 3, 1, "the sidebands leave no events of 3"),
     ],
 )
-def test_without_events_there_is_a_reason(cut, peak, sidebands, reason):
-    energies = np.array([2005.0, 2005, 2005, 2011])
-    found = peak_survival(np.ones(4), energies, cut, peak, sidebands)
-    assert reason in found.missing
-    assert found.survival is None
+def test_without_events_there_is_a_reason(cut, n, background, reason):
+    of = range_survival(np.ones(n), np.full(3, cut), np.ones(background), 5.0)
+    assert reason in of.missing
+    assert of.survival is None
 
 
 def test_curves_of_survival_are_the_analytic_ones():
@@ -233,10 +267,3 @@ def test_too_few_events_are_told() -> None:
     nothing = np.full(500, np.nan)
     assert against_energy({"data": nothing}, {"data": 2000 + 0 * nothing}, LINES).missing
     assert site_fit(np.full(500, 0.1)) is None
-
-
-def test_bootstraps_that_do_not_differ_are_no_error() -> None:
-    row = SurvivalRow()
-    row.compare({"data": (40.0, 3.0), "raw": (0.0, 4.0)}, {"raw": 0.0})
-    assert row.difference_std == {"raw": 5.0}
-    assert row.sigma == {"raw": -8.0}

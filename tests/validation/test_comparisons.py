@@ -11,11 +11,11 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from cpunet.pulses.shape_parameters import data_axis
-from cpunet.validation import bootstraps
-from cpunet.validation.bootstraps import Resampled, resampled_quantiles
+from cpunet.validation import comparisons
 from cpunet.validation.comparisons import (
     NODES,
     NULL_NODES,
+    Resampled,
     compare,
     drawn_distances,
     histogram,
@@ -141,12 +141,12 @@ def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape):
         assert values.std() == pytest.approx(1, abs=0.2), name
 
 
-WAYS = {"events": bootstraps.MAX_EVENTS, "bins": 0}  # what is drawn
+WAYS = {"events": comparisons.MAX_EVENTS, "bins": 0}  # what is drawn
 
 
 @pytest.fixture(params=WAYS.values(), ids=WAYS.keys())
 def either_way(request, monkeypatch):
-    monkeypatch.setattr(bootstraps, "MAX_EVENTS", request.param)
+    monkeypatch.setattr(comparisons, "MAX_EVENTS", request.param)
 
 
 def test_errors_of_scores_are_the_scatter_of_fresh_samples(either_way):
@@ -246,15 +246,3 @@ def test_draws_without_a_finite_value_are_left_out():
     few = resampled((100, 2), (100, 2), 1, 1)
     few[0].weights[0] = 0
     assert np.isnan(drawn_distances(rare, some, few, NODES))
-
-
-@pytest.mark.parametrize(("n", "quantile"), [(20, 0.1), (37, 0.1), (300, 0.5), (25, 0.01)])
-def test_quantiles_of_samples_are_those_of_the_direct_bootstrap(n, quantile):
-    rng = np.random.default_rng(8)
-    values = np.sort(np.r_[rng.exponential(size=n - 3), 7, 7, 7])
-    drawn = rng.choice(values, (20_000, n))
-    direct = np.quantile(drawn, quantile, axis=1, method="weibull")
-    found = resampled_quantiles(values, quantile, 20_000, rng)
-    assert found.std() == pytest.approx(direct.std(), rel=0.05)
-    # equal but for rounding, where one lies between two of few values
-    assert scipy.stats.ks_2samp(found.round(9), direct.round(9)).statistic < 0.02

@@ -10,10 +10,10 @@ from scipy.special import ndtr
 from cpunet.pulses.parameters import PARAMETERS, align_half_maximum
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.training.figures import sides_figure
-from cpunet.validation import run_figures
+from cpunet.validation import figures
 from cpunet.validation.comparisons import compare
+from cpunet.validation.figures import nearest, shape_figure
 from cpunet.validation.peaks import MeanPulse, around_half
-from cpunet.validation.run_figures import nearest, shape_figure
 from synthetic import LOSS_NAMES, load_recipe, require_drawn
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
@@ -35,7 +35,7 @@ def test_further_parameters_are_drawn_each():
     values = {
         name: {method: rng.normal(100, 5, 300) for method in ("data", "ren")} for name in names
     }
-    figure = run_figures.further_histograms(values, 40, "SEP")
+    figure = figures.further_histograms(values, 40, "SEP")
     require_drawn(figure)
     for axes, name in zip(figure.axes, names, strict=False):
         assert axes.get_xlabel() == SHAPE_PARAMETERS[name].axis_label
@@ -47,7 +47,7 @@ def test_all_losses_are_drawn_with_their_moving_average():
     for record in records:
         if record["iteration"] % 30:
             del record["losses"]["discriminator_data"]
-    figure = run_figures.loss_curves(records)
+    figure = figures.loss_curves(records)
     require_drawn(figure)
     assert [len(axes.lines) for axes in figure.axes] == [len(LOSS_NAMES) / 2] * 4
     average = figure.axes[1].lines[0].get_xydata()
@@ -68,7 +68,7 @@ def test_histogram_legend_tells_scores_and_counts():
     data, *methods = ({"drift_time": v} for v in values.values())
     comparison = compare(data, dict(zip(("raw", "ren"), methods, strict=True)), SCORES, 1)
     axis, name = data_axis(values["data"], SCORES.max_bins), "drift_time"
-    figure = run_figures.parameter_histograms(values, axis, name, "SEP", comparison[name])
+    figure = figures.parameter_histograms(values, axis, name, "SEP", comparison[name])
     require_drawn(figure)
     texts = [text.get_text() for text in figure.legends[0].get_texts()]
     assert texts[0].startswith("Data (data vs data ")
@@ -95,7 +95,7 @@ def test_differences_of_mean_pulses_are_in_standard_errors():
 def test_global_settings_neither_change_nor_matter():
     before = dict(mpl.rcParams)
     with mpl.rc_context({"font.size": 30.0, "axes.grid": False}):
-        figure = run_figures.loss_curves(log(5))
+        figure = figures.loss_curves(log(5))
         assert mpl.rcParams["font.size"] == 30.0
     assert dict(mpl.rcParams) == before
     assert figure.axes[0].xaxis.label.get_size() == 10.0

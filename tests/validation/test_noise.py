@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from cpunet.validation.figures import spectrum_of_noise
 from cpunet.validation.noise import baseline_spectra
-from cpunet.validation.run_figures import spectrum_of_noise
 
 SAMPLES, DT_NS = 200, 16.0
 

@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from scipy.special import ndtr
 
 from cpunet.errors import CpunetError
+from cpunet.validation.figures import shape_figure
 from cpunet.validation.methods import true_responses
 from cpunet.validation.peaks import around_half, sliced
-from cpunet.validation.run_figures import shape_figure
 from synthetic import paired_scores, require_drawn
 
 DT = 16.0

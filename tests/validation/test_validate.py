@@ -16,10 +16,11 @@ from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.published import UNKNOWN
 from cpunet.training.run import Run
 from cpunet.training.train import train
-from cpunet.validation.drawings import drawings
-from cpunet.validation.evaluation import Evaluation, _compared, evaluate
+from cpunet.validation.figures import drawings
 from cpunet.validation.methods import pair_squares, scores_of_squares
-from cpunet.validation.validate import validate
+from cpunet.validation.metrics import ALARM
+from cpunet.validation.peaks import classifier_excess, fit_ends
+from cpunet.validation.validate import Evaluation, _compared, evaluate, validate
 from synthetic import after_pole, decay, leave_undrawn, load_recipe, phased_edges, write_pulses
 
 # more poles than these pulses have take long to be looked for
@@ -113,7 +114,7 @@ def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) 
 
 
 def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:
-    monkeypatch.setattr("cpunet.validation.drawings.drawings", lambda found: {})  # above
+    monkeypatch.setattr("cpunet.validation.figures.drawings", lambda found: {})  # above
     sides = files["sim"], files["no DEP"]
     report = validate(run, *sides, tmp_path / "report", baselines=False)
     metrics = report.metrics
@@ -159,6 +160,27 @@ def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     how = {"energy_kev": of.energy_kev["raw"], "generator": np.random.default_rng(0)}
     again = of.ren.apply(of.windows["raw"], **how)
     np.testing.assert_array_equal(pulses["ren"], again[raw])
+
+
+def test_errors_of_the_fit_are_in_the_p_of_the_classifier(run, found):
+    peak, excess = found.sets[0], {}
+    for factor in (0, 1, 900):
+        covariance = (factor * np.array(run.fit.covariance)).tolist()
+        fit = run.fit.model_copy(update={"covariance": covariance})
+        ends = fit_ends(run.model_copy(update={"fit": fit}), peak.translations.ren)
+        excess[factor] = classifier_excess(peak, ends, seed=0)
+    assert excess[0] == 0
+    assert excess[1] < 0.05 < excess[900]
+    scored = found.metrics.peaks["FEP"].two_sample["ren"]
+    assert scored.of_fit == excess[1]
+    metrics, p = found.metrics.model_copy(deep=True), []
+    for of_fit in (0.0, 0.05, 0.6):
+        for auc in (scored.null_mean + 0.1, 0.95):
+            tested = dataclasses.replace(scored, auc=auc, null_std=0.02, of_fit=of_fit)
+            metrics.peaks["FEP"].two_sample["ren"] = tested
+            p.append(metrics.judge("FEP", "ren")["auc"].p)
+    assert p[0] < ALARM < p[2]
+    assert max(p[1], p[3]) < ALARM < min(p[4:])  # where any AUC is expected, none is off
 
 
 @pytest.fixture(scope="module")

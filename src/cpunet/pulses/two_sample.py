@@ -60,6 +60,8 @@ class TwoSample:
         Numbers of pulses used.  They are equal: the larger side is subsampled.
     missing_data, missing_sim
         Numbers of pulses left out because a value is not finite.
+    of_fit
+        Mean increase of the AUC of two samples of one distribution by the errors of a fit.
     """
 
     auc: float
@@ -70,6 +72,7 @@ class TwoSample:
     n_sim: int
     missing_data: int
     missing_sim: int
+    of_fit: float = 0.0
 
 
 def classifier_auc(
@@ -78,13 +81,14 @@ def classifier_auc(
     *,
     seed: int | np.random.Generator,
     features: tuple[Parameters, Parameters] | None = None,
+    same_events: bool = False,
 ) -> TwoSample:
     """Test whether two sets of pulses can be distinguished.
 
     The windows are used unchanged, so both sets must be prepared in the same way.  The
     features are the principal components of both sets together, and the size and roughness
     of the remainder, which reveals missing noise.  Pulses of the same events on both sides
-    would bias the AUC to below 0.5.
+    would bias the AUC to below 0.5, unless both are trained on, or none.
 
     Parameters
     ----------
@@ -95,6 +99,8 @@ def classifier_auc(
         Seed of the choice of pulses, the folds and the shuffles.
     features
         Further values per pulse by name, the same ones of the data and of the others.
+    same_events
+        Whether each row is the same event on both sides, for which both share their folds.
 
     Returns
     -------
@@ -116,6 +122,8 @@ def classifier_auc(
         np.flatnonzero(np.isfinite(windows).all(axis=1) & np.isfinite(extra).all(axis=1))
         for windows, extra in zip(sides, extras, strict=True)
     ]
+    if same_events:
+        usable = [np.intersect1d(usable[0], usable[1])] * 2
     size = min(LARGEST, *map(len, usable))
     if size < MIN_PULSES:
         raise CpunetError(
@@ -124,10 +132,12 @@ def classifier_auc(
             "of each"
         )
     rows = [np.sort(rng.choice(own, size, replace=False)) for own in usable]
+    if same_events:
+        rows[1] = rows[0]
     windows = np.concatenate([s[r] for s, r in zip(sides, rows, strict=True)]).astype(float)
     extra = np.concatenate([e[r] for e, r in zip(extras, rows, strict=True)])
 
-    aucs, stds = _cross_validated(_expanded(windows, extra), rng)
+    aucs, stds = _cross_validated(_expanded(windows, extra), rng, same_events)
     null_std, delong = aucs[1:].std(ddof=1), np.sqrt((stds[1:] ** 2).mean())
     widened = max(1.0, null_std / delong) if delong > 0 else 1.0
     missing = (len(side) - len(rows) for side, rows in zip(sides, usable, strict=True))
@@ -227,7 +237,9 @@ def _standard(values: Values, smallest: float = 0.0) -> Values:
     return np.asarray(np.clip((values - middle) / scale, -OUTLIER, OUTLIER))
 
 
-def _cross_validated(features: Values, rng: np.random.Generator) -> tuple[Values, Values]:
+def _cross_validated(
+    features: Values, rng: np.random.Generator, same_events: bool
+) -> tuple[Values, Values]:
     """AUC of the true labels and of each shuffle, and their errors for independent folds.
 
     The first half of the rows is one side.  Each fold has equal numbers of both sides, and
@@ -235,7 +247,8 @@ def _cross_validated(features: Values, rng: np.random.Generator) -> tuple[Values
     side that is rare in the training is frequent in the test.
     """
     size = len(features) // 2
-    fold = np.concatenate([rng.permutation(np.arange(size) % FOLDS) for _ in range(2)])
+    folds = [rng.permutation(np.arange(size) % FOLDS) for _ in range(2)]
+    fold = np.concatenate([folds[0], folds[0] if same_events else folds[1]])
     labels = np.repeat(np.repeat([-1.0, 1.0], size)[:, np.newaxis], 1 + SHUFFLES, axis=1)
     for k in range(FOLDS):
         rows = np.flatnonzero(fold == k)

@@ -315,7 +315,7 @@ class Run(InfoPart):
         """
         from cpunet.training.chain_description import describe_chain
         from cpunet.training.response import Response
-        from cpunet.validation.run_figures import loss_curves
+        from cpunet.validation.figures import loss_curves
 
         if self.recipe.generator.name != "response":
             return loss_curves(self.records)

@@ -143,28 +143,42 @@ def against_energy(
         too, although few of their events have one site.
     """
     lines = list(lines_kev.values())
-    single_site = [span for name, span in lines_kev.items() if name == DEP]
     lows = np.arange(LOWEST_KEV, HIGHEST_KEV, WIDTH_KEV).tolist()
+    single_site = [span for name, span in lines_kev.items() if name == DEP]
     single_site += [(low, low + WIDTH_KEV) for low in lows]
-    all_bands = single_site + [span for span in lines if span not in single_site]
-    for bands in (single_site, all_bands):
-        points = {
-            method: _site_fits(values, energy_kev[method], bands, lines)
-            for method, values in amplitude.items()
-        }
-        common = set.intersection(*map(set, points.values()))
+    others = [span for span in lines if span not in single_site]
+    fits: dict[str, dict[Range, SiteFit]] = {method: {} for method in amplitude}
+    about: dict[
+        str, tuple[float, float]
+    ] = {}  # the double-escape peak, the first, guides others
+    common: set[Range] = set()
+    for bands in (single_site, others):
+        for method, values in amplitude.items():
+            kev, off_lines = energy_kev[method], np.ones(len(values), bool)
+            for low, high in lines:
+                off_lines &= (kev < low - BESIDE_KEV) | (kev >= high + BESIDE_KEV)
+            for low, high in bands:
+                inside = (kev >= low) & (kev < high)
+                if (low, high) not in lines:
+                    inside &= off_lines
+                fitted = site_fit(values[inside], about.get(method))
+                if fitted is not None:
+                    about.setdefault(method, (fitted[0], fitted[2]))
+                    centre = float(kev[inside].mean())
+                    fits[method][low, high] = SiteFit(low, high, centre, *fitted)
+        common = set.intersection(*map(set, fits.values()))
         if len(common) >= 3:
             break
-    if len(common) < 3:  # a line through two points has no chi-square
+    else:  # a line through two points has no chi-square
         return AgainstEnergy(
             missing=f"A/E can be fitted in {len(common)} ranges of energy only; "
             "it takes three that both sides have: give events of more energies"
         )
     methods = {
-        method: _course([point for span, point in site_fits.items() if span in common])
-        for method, site_fits in points.items()
+        method: _course(sorted((of[span] for span in common), key=lambda p: p.energy_kev))
+        for method, of in fits.items()
     }
-    return AgainstEnergy(multi_site=bands is all_bands, methods=methods)
+    return AgainstEnergy(multi_site=bands is others, methods=methods)
 
 
 def site_fit(
@@ -209,16 +223,15 @@ def site_fit(
         mean, log_sigma, share, log_tail = parameters
         log_sigma, log_tail = np.clip(log_sigma, -3, 3), np.clip(log_tail, -2, 4)
         sigma, p, tail = np.exp(log_sigma), expit(share), np.exp(log_tail)
-        u = (x - mean) / sigma
         shift = sigma / tail
+
+        def tailed(u: Values) -> Values:
+            return np.asarray(np.exp(0.5 * shift**2 + u * shift + log_ndtr(-u - shift)))
+
+        u, ends = (x - mean) / sigma, (np.array([ABOVE, -BELOW]) - mean) / sigma
+        above, below = ndtr(ends) + p * tailed(ends)
         gauss = np.exp(-0.5 * u**2) / (sigma * np.sqrt(2 * np.pi))
-        tailed = np.exp(0.5 * shift**2 + u * shift + log_ndtr(-u - shift)) / tail
-        inside = [
-            ndtr(v) + p * np.exp(0.5 * shift**2 + v * shift + log_ndtr(-v - shift))
-            for v in ((ABOVE - mean) / sigma, (-BELOW - mean) / sigma)
-        ]
-        norm = max(float(inside[0] - inside[1]), 1e-12)
-        density = ((1 - p) * gauss + p * tailed) / norm
+        density = ((1 - p) * gauss + p * tailed(u) / tail) / max(above - below, 1e-12)
         # weak priors: a tail of a few widths, a tail fraction of about a third, and a width
         # near the given one, since otherwise a chance cluster of a few events can be taken
         # for the peak
@@ -237,26 +250,6 @@ def site_fit(
     return centre + width * mean, width * error, sigma, sigma * log_error, len(x)
 
 
-def _site_fits(
-    amplitude: Values, energy_kev: Values, bands: Sequence[Range], lines: Sequence[Range]
-) -> dict[Range, SiteFit]:
-    """Fits by range in the order of energy; the double-escape peak, the first, guides them."""
-    off_lines = np.ones(len(energy_kev), bool)
-    for low, high in lines:
-        off_lines &= (energy_kev < low - BESIDE_KEV) | (energy_kev >= high + BESIDE_KEV)
-    site_fits, about = {}, None
-    for low, high in bands:
-        inside = (energy_kev >= low) & (energy_kev < high)
-        if (low, high) not in lines:
-            inside &= off_lines
-        fitted = site_fit(amplitude[inside], about)
-        if fitted is not None:
-            about = about or (fitted[0], fitted[2])
-            centre = float(energy_kev[inside].mean())
-            site_fits[low, high] = SiteFit(low, high, centre, *fitted)
-    return dict(sorted(site_fits.items(), key=lambda item: item[1].energy_kev))
-
-
 def _course(points: list[SiteFit]) -> Course:
     """Fit a straight line to the means, 1 at the reference energy, and a law to the widths."""
     from scipy.optimize import nnls
@@ -267,15 +260,8 @@ def _course(points: list[SiteFit]) -> Course:
     covariance = np.linalg.inv(design.T @ design) / scale**2
     chi_square = float(np.sum(((mean - scale - slope * (energy - REFERENCE_KEV)) / error) ** 2))
     a, (a_error, scale_error) = float(slope / scale), np.sqrt(np.diag(covariance)).tolist()
-    line = MeanLine(
-        a=a,
-        b=1 - a * REFERENCE_KEV,
-        a_error=a_error,
-        per_mev_percent=1e5 * a,
-        per_mev_error_percent=1e5 * a_error,
-        chi_square=chi_square,
-        degrees=len(points) - 2,
-    )
+    of_line = (a, 1 - a * REFERENCE_KEV, a_error, 1e5 * a, 1e5 * a_error, chi_square)
+    line = MeanLine(*of_line, degrees=len(points) - 2)
     # a and b of sqrt(a + (b/E)^2), neither below 0, from the squared widths
     terms = np.stack([np.ones(len(energy)), 1e6 / energy**2], axis=1)
     relative, spread = sigma / mean, sigma_error / mean

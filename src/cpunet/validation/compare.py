@@ -20,7 +20,14 @@ from cpunet.pulses.two_sample import TwoSample
 from cpunet.tables import NO_VALUE, text_table, with_std
 from cpunet.training.response import FAR, Response, outliers, response
 from cpunet.training.run import Run, RunLike
-from cpunet.validation.metrics import MAIN, QUANTITIES, Metrics, PeakScores, signed
+from cpunet.validation.metrics import (
+    MAIN,
+    QUANTITIES,
+    SURVIVAL,
+    Metrics,
+    PeakScores,
+    signed,
+)
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
 
 if TYPE_CHECKING:
@@ -258,19 +265,18 @@ def compared(
     failed
         Reports to list as missing: what is in their folders is of an earlier validation.
     """
-    places: list[Path] = []
-    opened: list[Report | None] = []
+    opened: list[tuple[Path, Report | None]] = []
     for report in reports:
         if isinstance(report, Report):  # of one in memory the run has a name
-            places.append(report.folder or Path(report.metrics.compared["run"]))
-            opened.append(report)
+            opened.append((report.folder or Path(report.metrics.compared["run"]), report))
             continue
         path = Path(report)
         files = (path, path / METRICS, path / "report" / METRICS)  # the last one of a demo
         file = next((f for f in files if f.is_file() and path not in failed), None)
-        places.append(path)
-        opened.append(Report(read_metrics(file), folder=file.parent) if file else None)
-    named = dict(zip(_names(places), opened, strict=True))
+        stored = Report(read_metrics(file), folder=file.parent) if file else None
+        opened.append((path, stored))
+    places = [place for place, _ in opened]
+    named = {name: of for name, (_, of) in zip(_names(places), opened, strict=True)}
     runs = {name: report for name, report in named.items() if report is not None}
     if not runs:
         raise CpunetError(
@@ -301,16 +307,12 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
         cells["classifier: AUC"] = tested.auc, tested.auc_std, text, off
     if method in scores.paired and (edge := scores.paired[method].edge_rmse) is not None:
         cells["edge RMSE [10⁻³]"] = 1e3 * edge, None, f"{1e3 * edge:#.3g}", edge
-    differences = {}
-    for name in (name for name in MAIN if name in scores.judged):
-        compared, unit = scores.judged[name], LABELLED[name].unit
-        title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
-        differences[title] = compared.shift.get(method), compared.shift_std.get(method)
-    if (row := metrics.survival.get(peak)) is not None:
-        title = "A/E survival minus data [points]"
-        differences[title] = row.difference.get(method), row.difference_std.get(method)
-    for title, (difference, std) in differences.items():
+    verdicts = metrics.judge(peak, method) if peak in metrics.peaks else {}
+    for name in (*MAIN, SURVIVAL):
+        difference, std = verdicts[name].difference if name in verdicts else (None, None)
         if difference is not None:
+            unit = "points" if name == SURVIVAL else LABELLED[name].unit
+            title = f"{QUANTITIES[name]} minus data" + (f" [{unit}]" if unit else "")
             cells[title] = difference, std, signed(difference, std), abs(difference)
     return cells
 

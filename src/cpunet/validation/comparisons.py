@@ -29,11 +29,14 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import data_axis
 from cpunet.recipes.schema import ScoreConfig
-from cpunet.validation.bootstraps import Resampled
 
 NODES = 256  # bins for bootstrapped errors; a finer grid gives the same spread
 NULL_NODES = 4096  # and for a null, whose mean is compared with exact values
 Histogram = npt.NDArray[np.floating]
+
+# Above this number of events, bin counts are drawn directly, in a time independent of the
+# number of events; below it, sums over drawn events are up to ten times faster.
+MAX_EVENTS = 16_384
 
 # Bins of a test of two samples, and events of the smaller one expected in each.
 TEST_BINS, EXPECTED = 16, 15
@@ -109,6 +112,65 @@ class Compared(Result):
     axis: Binning = Binning()
 
 
+class Resampled:
+    """Bootstrap samples of a dataset, drawn with replacement.
+
+    Parameters
+    ----------
+    events, size
+        Number of events of the dataset, and of each sample.
+    draws
+        Number of samples.
+    rng
+        Random generator.
+
+    Attributes
+    ----------
+    weights
+        Multiplicity of each event in each sample, shape ``(events, draws)``; None for a large
+        dataset, whose bin counts are drawn anew each time.
+    """
+
+    weights: npt.NDArray[np.float32] | None = None
+
+    def __init__(self, events: int, size: int, draws: int, rng: np.random.Generator) -> None:
+        self.events, self.size, self.draws, self.rng = events, size, draws, rng
+        if events and max(events, size) <= MAX_EVENTS:
+            drawn = rng.integers(events, size=(size, draws), dtype=np.int32)
+            drawn *= draws
+            drawn += np.arange(draws, dtype=np.int32)
+            counts = np.bincount(drawn.ravel(), minlength=events * draws)
+            self.weights = counts.astype(np.float32).reshape(events, draws)
+
+    def counts(self, bins: npt.NDArray[np.integer], n_bins: int) -> npt.NDArray[np.float32]:
+        """Histograms of the samples.
+
+        Parameters
+        ----------
+        bins
+            Bin of each event; events beyond the last bin are not counted.
+        n_bins
+            Number of bins.
+
+        Returns
+        -------
+        numpy.ndarray
+            Counts, float32, shape ``(n_bins, draws)``; all 0 if the dataset is empty.
+        """
+        from scipy.sparse import csc_array
+
+        if not self.events:
+            return np.zeros((n_bins, self.draws), np.float32)
+        if self.weights is None:
+            shares = np.bincount(bins, minlength=n_bins + 1) / self.events
+            drawn = self.rng.multinomial(self.size, shares, size=self.draws)
+            return np.ascontiguousarray(drawn[:, :n_bins].T, np.float32)
+        ones = np.ones(self.events, np.float32)
+        one_bin_each = (ones, bins.astype(np.int32), np.arange(self.events + 1, dtype=np.int32))
+        summed = csc_array(one_bin_each, shape=(n_bins + 1, self.events)) @ self.weights
+        return np.asarray(summed[:n_bins])
+
+
 def finite_values(values: Values) -> Values:
     """Those values that are neither NaN nor infinite."""
     return values[np.isfinite(values)]
@@ -181,9 +243,9 @@ def drawn_distances(a: Values, b: Values, draws: Sequence[Resampled], nodes: int
     >>> drawn_distances(same, same, draws, NULL_NODES)
     array([0., 0., 0.])
     """
-    if not (np.isfinite(a).any() and np.isfinite(b).any()):
-        return np.full(1, np.nan)
     pooled = np.sort(finite_values(a if a is b else np.concatenate([a, b])))
+    if not pooled.size:
+        return np.full(1, np.nan)
     # a few outliers can dominate W1: the outermost values have bins of their own
     n, tail = len(pooled), nodes // 8
     edges = pooled

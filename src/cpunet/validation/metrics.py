@@ -2,8 +2,8 @@
 
 There is a p-value for each quantity, and words.  Each p-value is the probability that two
 samples of one distribution differ by more.  It contains the sampling of both sides and, of a
-REN with a covariance, the errors of the fit; that of the classifier contains the sampling
-alone.  What is less likely than `ALARM`, three standard deviations, is off.
+REN with a covariance, the errors of the fit.  What is less likely than `ALARM`, three standard
+deviations, is off.
 ``benchmarks/p_values.py`` shows that p is uniform where nothing is wrong.
 
 An agreement says no more than its sensitivity: the difference is quoted with its error.
@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
 from pydantic import Field
 from scipy.special import ndtr, ndtri, stdtr
 
@@ -32,6 +33,8 @@ from cpunet.validation.noise import Spectrum
 ALARM = 2.7e-3  # p of three standard deviations
 SAME = 3e-5  # 1 - p of samples that agree too well
 SMALLEST = 1e-12  # p that is stated
+LEAST_AUC = 1e-3  # and most: beyond, quantiles diverge
+QUANTILE_SLOPE = math.sqrt(2 * math.pi)  # of the normal quantile at one half
 NAMED = 3  # quantities that a headline names
 WRITTEN = ("p", "sigma", "numbers", "words")  # of a verdict
 
@@ -39,8 +42,8 @@ WRITTEN = ("p", "sigma", "numbers", "words")  # of a verdict
 MAIN = (A_OVER_E, "rise_time", "tail_slope", "lq")
 RIVALS = ("rc", "rc_late")
 
+SURVIVAL, _AUC, _NOISE, _SPECTRUM = "ae_survival", "auc", "noise", "noise_spectrum"
 _SHORT = {"ren": "REN", "iren": "IREN"}
-_AUC, _SURVIVAL, _NOISE, _SPECTRUM = "auc", "ae_survival", "noise", "noise_spectrum"
 QUANTITIES = {
     A_OVER_E: "A/E",
     "current_amplitude": "A",
@@ -48,7 +51,7 @@ QUANTITIES = {
     "tail_slope": "tail slope",
     "lq": "LQ",
     _AUC: "classifier AUC",
-    _SURVIVAL: "A/E survival",
+    SURVIVAL: "A/E survival",
 }
 _CALLED = QUANTITIES | {_AUC: "classifier", "current_amplitude": "current amplitude"}
 
@@ -251,17 +254,24 @@ class Metrics(Result):
         if isinstance(tested, Missing):
             verdicts[_AUC] = Verdict(None, reason=tested.missing)
         elif tested is not None:
-            null, std = tested.null_mean, tested.null_std
-            more, p = tested.auc - null, None
+            # the errors of a fit raise the AUC by so much, with a spread as large; on the scale
+            # of the normal quantile separations add
+            null, std, p = tested.null_mean + tested.of_fit, tested.null_std, None
+            aucs = np.clip((tested.auc, null, tested.null_mean), LEAST_AUC, 1 - LEAST_AUC)
+            place, expected, least = ndtri(aucs) / QUANTILE_SLOPE
             if std:
-                p = stdtr(SHUFFLES - 1, -more / (std * math.sqrt(1 + 1 / SHUFFLES)))
+                spread = math.hypot(std, expected - least)
+                p = stdtr(
+                    SHUFFLES - 1, (expected - place) / (spread * math.sqrt(1 + 1 / SHUFFLES))
+                )
+            more, std = tested.auc - null, math.hypot(std, tested.of_fit)
             words = f"AUC {with_std(tested.auc, std)}, {null:.2f} expected"
             data = with_std(null, std)
             verdicts[_AUC] = Verdict(p and float(p), words, "no value", (more, std), data)
         row = self.survival.get(peak)
         if row is not None and row.difference:
             off = row.difference.get(method), row.difference_std.get(method)
-            verdicts[_SURVIVAL] = Verdict(
+            verdicts[SURVIVAL] = Verdict(
                 two_sided(*off),
                 f"{signed(*off)} points" if off[1] else "",
                 "too few events of the double-escape peak, or none of this one",
@@ -289,25 +299,25 @@ class Metrics(Result):
         agreements = [v.agrees for v in verdicts if v.agrees is not None]
         return agreements.count(False), len(agreements)
 
-    def headline(self, method: str = "ren") -> tuple[bool, str]:
+    def headline(self) -> tuple[bool, str]:
         """Whether nothing is off at peaks that were not trained on, and that in a sentence."""
-        peaks, name = self.held_out, _SHORT.get(method, label(method))
+        peaks = self.held_out
         judged = sorted(
             (v.p, f"{peak} {called(quantity)}")
             for peak in peaks
-            for quantity, v in self.judge(peak, method).items()
+            for quantity, v in self.judge(peak, "ren").items()
             if v.p is not None
         )
         if not judged:
-            return False, f"{name}: not judged"
+            return False, "REN: not judged"
         of, off = f"quantities of {' and '.join(peaks)}", sum(p < ALARM for p, _ in judged)
         named = judged[: min(max(off, 1), NAMED)]
         first = ", ".join(f"{quantity} ({_p(p)})" for p, quantity in named)
         if not off:
-            agreed = f"{name} agrees with the data in all {len(judged)} {of}"
+            agreed = f"REN agrees with the data in all {len(judged)} {of}"
             return True, f"{agreed}; the least likely is {first}"
         more = " and others" if off > NAMED else ""
-        return False, f"{name} is off in {off} of {len(judged)} {of}: {first}{more}"
+        return False, f"REN is off in {off} of {len(judged)} {of}: {first}{more}"
 
     def summary(self, peak: str, method: str = "ren") -> str:
         """One line: what is off, the least likely first, and with what p the others agree.
@@ -349,12 +359,12 @@ class Metrics(Result):
             judged, verdicts = self.peaks[peak].judged, self.judge(peak, "ren")
             others = [self.judge(peak, m) for m in rivals]
             first = A_OVER_E if A_OVER_E in judged else "current_amplitude"
-            for name in (first, *MAIN[1:], _AUC, _SURVIVAL):
+            for name in (first, *MAIN[1:], _AUC, SURVIVAL):
                 if name not in verdicts or (p := verdicts[name].p) is None:
                     continue
                 compared = judged.get(name, Compared())
                 unit = (
-                    "%" if name == _SURVIVAL else LABELLED[name].unit if name in judged else ""
+                    "%" if name == SURVIVAL else LABELLED[name].unit if name in judged else ""
                 )
                 rows.append([
                     *(peak, f"{QUANTITIES[name]} [{unit}]" if unit else QUANTITIES[name]),

@@ -27,8 +27,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
@@ -37,16 +36,21 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum
+from cpunet.pulses.parameters import (
+    PARAMETERS,
+    Values,
+    align_half_maximum,
+    pulse_parameters,
+)
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
-from cpunet.pulses.two_sample import TwoSample, classifier_auc
+from cpunet.pulses.two_sample import LARGEST, TwoSample, classifier_auc
 from cpunet.training.closed_forms import error_ends
 from cpunet.training.run import Run
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import REN
 from cpunet.validation.comparisons import Missing, compare
-from cpunet.validation.methods import Translations, scores_of_squares
+from cpunet.validation.methods import Translations, like_data, scores_of_squares
 from cpunet.validation.metrics import PeakScores
 from cpunet.validation.noise import baseline_spectra
 
@@ -54,6 +58,7 @@ BEFORE_NS, AFTER_NS = 1600.0, 2400.0  # of a mean pulse before and after half ma
 SLICES = 4
 MIN_PULSES = 10  # minimum number of pulses of a distribution
 MOVED = 300  # pulses of a peak, for which the errors of a fit are calculated
+FIT_DRAWS = 8  # of the parameters, for the classifier
 
 Rows = npt.NDArray[np.int64]
 ByMethod = dict[str, dict[str, Values]]
@@ -243,9 +248,21 @@ def score_peak(
     compared = compare(values["data"], others, recipe.scores, seed, moved)
     result.parameters = {name: compared.pop(name) for name in PARAMETERS}
     result.further = compared
+
+    def classified(method: str) -> TwoSample | Missing:
+        both = ("data", method)
+        chief = [{n: values[m][n] for n in PARAMETERS} for m in both]
+        try:
+            return classifier_auc(
+                *map(peak.windows, both), seed=seed, features=(chief[0], chief[1])
+            )
+        except CpunetError as error:
+            return Missing(missing=str(error))
+
     with ThreadPoolExecutor(usable_cores()) as pool:
-        tests = pool.map(partial(classifier_test, peak, seed), methods)
-        result.two_sample = dict(zip(methods, tests, strict=True))
+        result.two_sample = dict(zip(methods, pool.map(classified, methods), strict=True))
+    if ends and isinstance(tested := result.two_sample["ren"], TwoSample):
+        result.two_sample["ren"] = replace(tested, of_fit=classifier_excess(peak, ends, seed))
     samples, before = recipe.preparation.baseline_samples, recipe.preparation.samples_before
     result.noise = baseline_spectra(
         {m: of_all.windows[m][rows, :samples] for m, rows in peak.rows.items()},
@@ -257,26 +274,6 @@ def score_peak(
         rows = peak.known_to_all()
         result.paired = {m: scores_of_squares(of[rows]) for m, of in of_all.squares.items()}
     return result
-
-
-def classifier_test(peak: PeakSets, seed: int, method: str) -> TwoSample | Missing:
-    """Classifier test between a method and the data by their pulses and chief parameters.
-
-    Parameters
-    ----------
-    peak
-        Pulses of the peak and their values.
-    seed
-        Seed of the folds.
-    method
-        Name of the method.
-    """
-    both = ("data", method)
-    data, own = ({n: peak.values[m][n] for n in PARAMETERS} for m in both)
-    try:
-        return classifier_auc(*map(peak.windows, both), seed=seed, features=(data, own))
-    except CpunetError as error:
-        return Missing(missing=str(error))
 
 
 def fit_ends(run: Run, ren: REN) -> Ends:
@@ -293,6 +290,53 @@ def fit_ends(run: Run, ren: REN) -> Ends:
             both.append(moved)
         ends.append((both[0], both[1]))
     return ends
+
+
+def classifier_excess(peak: PeakSets, ends: Ends, seed: int) -> float:
+    r"""How much the errors of a fit raise the AUC of the classifier, on average.
+
+    Translations with parameters drawn from the covariance of the fit, which are the nominal
+    ones :math:`x` and changes with normal numbers :math:`z_k`,
+
+    .. math:: x' = x + \sum_k z_k \frac{x_{k+} - x_{k-}}{2}
+
+    with those at both ends of each axis, differ from others as a measurement of the same
+    detector does.  So the AUC between the two is by so much above that of translations with the
+    same parameters.
+
+    Parameters
+    ----------
+    peak
+        Pulses of the peak.
+    ends
+        See `fit_ends`.
+    seed
+        Seed of the noise, the draws and the folds.
+    """
+    of_all, rows = peak.translations, peak.rows["ren"]
+    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), LARGEST)).astype(int)]
+    kev, recipe, dt_ns = of_all.energy_kev["ren"][rows], of_all.ren.recipe, of_all.ren.dt_ns
+    raw = Pulses.of(of_all.windows["raw"][rows], dt_ns=dt_ns, energy_kev=kev)
+
+    def translated(ren: REN, noise: int) -> FloatArray:
+        return like_data(ren, raw, np.random.default_rng([seed, noise]))
+
+    def chief(windows: FloatArray) -> dict[str, Values]:
+        pulses = Pulses.of(windows, dt_ns=dt_ns)
+        return pulse_parameters(pulses, recipe.preparation, recipe.scores)
+
+    first, second = translated(of_all.ren, 1), translated(of_all.ren, 2)
+    changes = [0.5 * (translated(one, 2) - translated(other, 2)) for one, other in ends]
+    draws = np.random.default_rng(seed).normal(size=(FIT_DRAWS, len(ends)))
+    of_first, aucs = chief(first), []
+    for steps in (np.zeros(len(ends)), *draws):
+        moved = second.copy()
+        for step, change in zip(steps, changes, strict=True):
+            moved += np.float32(step) * change
+        both = (of_first, chief(moved))
+        tested = classifier_auc(first, moved, seed=seed, features=both, same_events=True)
+        aucs.append(tested.auc)
+    return max(float(np.mean(aucs[1:])) - aucs[0], 0.0)
 
 
 def moved_values(peak: PeakSets, ends: Ends, seed: int) -> dict[str, Values]:

@@ -1,8 +1,13 @@
-"""The result of a validation: scores, values, figures, and the folder that holds them."""
+"""The result of a validation: scores, values, figures, and the folder that holds them.
+
+The page is self-contained: figures and script are embedded, and its content security policy
+blocks all requests.
+"""
 
 from __future__ import annotations
 
 import json
+import re
 from collections import UserDict
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,10 +21,13 @@ from pydantic import ValidationError
 
 from cpunet.errors import CpunetError, named
 from cpunet.outputs import FolderKind, folder_written_aside
+from cpunet.plotting import COLOURS, label
+from cpunet.progress import stage
 from cpunet.pulses.parameters import Values
-from cpunet.settings import read_json
-from cpunet.tables import text_table
-from cpunet.validation.metrics import Metrics
+from cpunet.pulses.shape_parameters import LABELLED
+from cpunet.settings import flat, read_json
+from cpunet.tables import number, text_table, with_std
+from cpunet.validation.metrics import Metrics, called
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,6 +55,40 @@ _NAMES = {
     "ceiling": "data vs data",
 }
 _SHOWN = ("raw", "ren", "truth", "ceiling")  # methods in a notebook's table
+
+
+FIRST = 3  # figures of overlap and mean pulses at the top of the page, and of noise
+# What a figure shows, for readers of its text alone, by section and the end of its name.
+SECTIONS = {
+    "first": {
+        "overlap with data": "overlap with data by quantity and method; band: data with data",
+        "mean pulse": "mean pulse of the data and each method; differences in standard errors",
+    },
+    "slices": {
+        "superpulses": "mean pulses in four ranges of rise time; differences in standard errors"
+    },
+    "noise": {"noise": "noise power before the pulse by frequency, data and REN; their ratio"},
+    "pulses": {
+        "single pulse": "one simulated pulse by each method, and the nearest measured one"
+    },
+    "further": {
+        "further parameters": "distributions of further parameters, data and each method"
+    },
+    "ae": {
+        "A over E survival": "survival of other peaks against that of the double-escape peak"
+    },
+    "ae_energy": {
+        "A over E and energy": "position and width of the single-site A/E peak against energy"
+    },
+    "others": {
+        "losses": "losses of the training by iteration",
+        "cycle of simulation": "simulated pulses, their translations, and those back",
+        "cycle of data": "measured pulses, their translations, and those back",
+    },
+    "distributions": {
+        "": "distribution in the data and by each method, and differences in standard errors"
+    },
+}
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,16 +150,15 @@ class Report:
 
         index = ["peak", "parameter", "method"]
         columns = [*index, "iou", "iou_std", "ceiling", "wasserstein"]
-        rows = []
-        for peak, scores in self.metrics.peaks.items():
-            for parameter, of in scores.parameters.items():
-                for method in (method for method in of.iou if method != "ceiling"):
-                    score, error, w1 = (
-                        by.get(method) for by in (of.iou, of.iou_std, of.wasserstein)
-                    )
-                    rows.append(
-                        [peak, parameter, method, score, error, of.iou.get("ceiling"), w1]
-                    )
+        rows = [
+            [peak, parameter, method]
+            + [by.get(method) for by in (of.iou, of.iou_std)]
+            + [of.iou.get("ceiling"), of.wasserstein.get(method)]
+            for peak, scores in self.metrics.peaks.items()
+            for parameter, of in scores.parameters.items()
+            for method in of.iou
+            if method != "ceiling"
+        ]
         return DataFrame(rows, columns=columns).set_index(index)
 
     def __getitem__(self, peak: str) -> DataFrame:
@@ -202,7 +243,7 @@ class Report:
             If there is no such peak, or no such parameter is scored there.
         """
         from cpunet.plotting import own_axes
-        from cpunet.validation.run_figures import draw_parameter
+        from cpunet.validation.figures import draw_parameter
 
         peak = next(iter(self.values)) if peak is None else peak
         of_peak = named(self.values, peak, "scored peak")
@@ -228,11 +269,17 @@ class Report:
             self.write(aside)
 
     def write(self, folder: Path) -> None:
-        """Write the report into an existing folder, see `save`."""
-        from cpunet.validation.page import write_page
+        """Write the report into an existing folder, see `save`.
+
+        Names of figures become file names and captions.
+        """
+        from markupsafe import Markup
+
+        from cpunet.html_pages import asset, figure_html, rendered
 
         if self.drawn is None:
             raise CpunetError(f"{self.folder}: is a report already", "copy the folder")
+        metrics = self.metrics
         text = json.dumps(self.to_dict(), indent=2, allow_nan=False, ensure_ascii=False)
         (folder / METRICS).write_text(text + "\n", encoding="utf-8")
         parameters = {
@@ -242,7 +289,50 @@ class Report:
             for name in of_method
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
-        write_page(folder, self.metrics, self.drawn, self.notes)
+
+        placed: dict[str, dict[str, Markup]] = {place: {} for place in SECTIONS}
+        with stage("Drawing", len(self.drawn)) as bar:
+            for name, draw in self.drawn.items():
+                stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
+                caption = name.replace("_", " ")
+                place, shows = next(
+                    (section, text)
+                    for section, of_section in SECTIONS.items()
+                    for end, text in of_section.items()
+                    if caption.endswith(end)
+                )
+                placed[place][name] = figure_html(
+                    caption, draw(), folder / f"{stem}.svg", shows
+                )
+                bar.update(1)
+        # of each method that is drawn, for the page's legend
+        drawn = "".join(html for of_place in placed.values() for html in of_place.values())
+        methods = dict.fromkeys(re.findall('data-method="([^"]*)"', drawn))
+        # of mean pulses and noise a few, preferably of peaks that took no part in the training
+        peak = str(metrics.training.get("peak"))
+        trained = tuple(f"{name} " for name in (peak, *peak.split(",")))
+        for place in ("first", "noise"):
+            shown = placed[place]
+            few = [n for n in shown if not n.startswith(trained)][:FIRST] or [*shown][:FIRST]
+            placed["others"] |= {name: html for name, html in shown.items() if name not in few}
+            placed[place] = {name: shown[name] for name in few}
+        good, verdict = metrics.headline() if metrics.scored else (False, "")
+        html = rendered(
+            "report.html",
+            title="CPU-Net validation",
+            metrics=metrics,
+            placed={place: [*of_place.values()] for place, of_place in placed.items()},
+            notes=self.notes,
+            good=good,
+            headline=verdict,
+            methods=[{"name": m, "label": label(m), "colour": COLOURS[m]} for m in methods],
+            rejections=[*flat(metrics.rejections, ": ")],
+            training=[*flat(metrics.training, ": ")],
+            script=Markup(asset("report.js")),
+            **{f.__name__: f for f in (called, label, number, with_std)},
+            unit=lambda name: LABELLED[name].unit,
+        )
+        (folder / PAGE).write_text(html, encoding="utf-8")
 
     def __str__(self) -> str:
         table = self._table(_METHODS)

@@ -27,8 +27,7 @@ from cpunet.training.job import TrainingJob
 from cpunet.training.run import resolve_device
 from cpunet.training.unfinished import differences
 from cpunet.translation.translator import REN
-from cpunet.validation.bootstraps import Resampled
-from cpunet.validation.comparisons import NULL_NODES, drawn_distances, wasserstein
+from cpunet.validation.comparisons import NULL_NODES, Resampled, drawn_distances, wasserstein
 from cpunet.validation.methods import like_data
 
 if TYPE_CHECKING:
@@ -153,12 +152,11 @@ def _write(out: Path, study: Study, recipe: Recipe) -> None:
     with written_aside(out / TABLE) as aside:
         columns = ("number", "state", "value", "duration", "params", "user_attrs")
         study.trials_dataframe(columns).to_csv(aside, index=False)
-    try:
-        best = study.best_trial
-    except ValueError as error:
-        reasons = [t.user_attrs[REASON] for t in study.trials if REASON in t.user_attrs]
-        first = next(iter(reasons), "interrupted")
-        raise CpunetError(f"{out}: no trial has a score; the first: {first}") from error
+    if all(trial.value is None for trial in study.trials):
+        reasons = (t.user_attrs[REASON] for t in study.trials if REASON in t.user_attrs)
+        first = next(reasons, "interrupted")
+        raise CpunetError(f"{out}: no trial has a score; the first: {first}")
+    best = study.best_trial
     description = f"{recipe.description}; tuned, trial {best.number}"
     tuned = read_settings(Recipe, recipe, best.params).model_copy(
         update={"name": f"{recipe.name}-tuned", "description": description}

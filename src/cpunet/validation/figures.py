@@ -9,8 +9,10 @@ simulated pulse is therefore shown with the measured pulse nearest to its transl
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import hist
 import numpy as np
@@ -25,23 +27,27 @@ from cpunet.plotting import (
     GROUP,
     LINE,
     STACKED,
-    group,
     label,
     legend_above,
     line,
     panels,
+    points,
     steps,
     styled,
 )
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import LABELLED, data_axis
+from cpunet.translation.translator import IREN
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import REFERENCE_KEV, Course, columns
 from cpunet.validation.comparisons import Compared, finite_values, histogram
-from cpunet.validation.metrics import QUANTITIES, Metrics
+from cpunet.validation.metrics import QUANTITIES, Metrics, PeakScores
 from cpunet.validation.noise import Spectrum
-from cpunet.validation.peaks import BEFORE_NS, MeanPulse
+from cpunet.validation.peaks import BEFORE_NS, MeanPulse, PeakSets, around_half, sliced
+
+if TYPE_CHECKING:
+    from cpunet.validation.validate import Evaluation
 
 AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is stated
@@ -49,6 +55,11 @@ SIGMAS, PERCENT = 8.0, 3.0  # range of differences in standard errors, and of fu
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
+SINGLE = ("raw", "rc", "rc_late", "ren", "truth")  # methods in the figure of a single pulse
+SLICED = ("data", "rc", "rc_late", "ren")  # and in slices
+SHOWN = 10  # pulses in a figure of cycles, as in the paper
+
+Drawing = Callable[[], Figure]
 
 
 @styled
@@ -180,9 +191,8 @@ def overlap_figure(metrics: Metrics) -> Figure:
         axes.hlines(iou["ceiling"], x - 0.45, x + 0.45, color=COLOURS["data"], lw=1)
         for i, method in enumerate(methods):
             at = x + 0.7 * ((i + 0.5) / len(methods) - 0.5)
-            look = {"color": COLOURS[method], "marker": "o", "markersize": 3.5, "lw": 0}
-            look |= {"elinewidth": 1, "label": label(method)}
-            group(axes.errorbar(at, iou[method], error[method], **look), method)
+            look = {"markersize": 3.5, "lw": 0, "elinewidth": 1, "label": label(method)}
+            points(axes, at, iou[method], error[method], method, **look)
         axes.set(title=peak, xticks=range(len(compared)), ylim=(0, 100))
         texts = [QUANTITIES.get(name, name.replace("_", " ")) for name in compared]
         axes.set_xticklabels(texts, rotation=30, ha="right")
@@ -297,14 +307,13 @@ def shape_figure(
                 error = np.hypot(pulse.error, data.error) if data.n > 1 else np.array(0.01)
                 pull = (mean - data.mean) / np.where(error > 0, error, np.nan)
                 line(below, time_ns, pull, method)
-        most = max((pulse.n for method, pulse in pulses.items() if method != "data"), default=0)
-        counts = f"{data.n} measured, {most} simulated pulses"
-        if data.n > 1:
-            above.text(0.97, 0.03, counts, ha="right", transform=above.transAxes, size=8)
         above.set(title=name, xlim=(time_ns[0], time_ns[-1]))
         below.axhline(0, color="black", linewidth=0.8)
         below.set_xlabel("Time from half maximum [ns]")
         if data.n > 1:
+            most = max(pulse.n for method, pulse in pulses.items() if method != "data")
+            counts = f"{data.n} measured, {most} simulated pulses"
+            above.text(0.97, 0.03, counts, ha="right", transform=above.transAxes, size=8)
             sigma_panel(below)
             below.label_outer()
         else:  # a pulse alone has no error
@@ -395,12 +404,10 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
     for method, course in methods.items():
         colour, line = COLOURS[method], course.mean
         energy, mean, error, sigma, sigma_error = columns(course.points)
-        look = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 3.5}
-        for axes, value, spread in (
-            (above, mean / course.scale - 1, error / course.scale),
-            (below, sigma / mean, sigma_error / mean),
-        ):
-            group(axes.errorbar(energy, 100 * value, 100 * spread, **look), method)
+        look = {"linestyle": "none", "markersize": 3.5}
+        shift, scaled = 100 * (mean / course.scale - 1), 100 * error / course.scale
+        points(above, energy, shift, scaled, method, **look)
+        points(below, energy, 100 * sigma / mean, 100 * sigma_error / mean, method, **look)
         along = np.linspace(energy.min(), energy.max(), 100)
         text = f"{label(method)}: {line.per_mev_percent:+.3f} ± "
         text += f"{line.per_mev_error_percent:.3f} % per MeV"
@@ -429,14 +436,12 @@ def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
     drawn = {method: spectrum for method, spectrum in spectra.items() if not spectrum.missing}
     for method, spectrum in drawn.items():
         power, error = np.array(spectrum.power), np.array(spectrum.power_std)
-        look = {"color": COLOURS[method], "marker": "o", "markersize": 3}
-        bars = above.errorbar(spectrum.frequency_mhz, power, error, label=label(method), **look)
-        group(bars, method)
+        look = {"markersize": 3, "label": label(method)}
+        points(above, spectrum.frequency_mhz, power, error, method, **look)
         if method != "data":
             # bands without noise in the data have no ratio
             usual = np.where(data > 0, data, np.nan)
-            bars = below.errorbar(spectrum.frequency_mhz, power / usual, error / usual, **look)
-            group(bars, method)
+            points(below, spectrum.frequency_mhz, power / usual, error / usual, method, **look)
     below.axhline(1, color="black", linewidth=0.8)
     silent = not any(any(spectrum.power) for spectrum in drawn.values())
     above.set(
@@ -451,3 +456,79 @@ def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
         axis.set_minor_formatter("")
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
     return figure
+
+
+def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
+    """Functions that draw the figures of a validation, by name; they hold what they draw."""
+    drawn: dict[str, Drawing] = {}
+    metrics, run = evaluated.metrics, evaluated.run
+    if metrics.held_out:
+        drawn["overlap with data"] = partial(overlap_figure, metrics)
+    if courses := metrics.ae_energy.methods:
+        drawn["A over E and energy"] = partial(ae_energy_figure, courses)
+    scored = [peak for peak in evaluated.sets if peak.values]
+    for peak in scored:
+        of_peak = _of_peak(peak, metrics.peaks[peak.name])
+        drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak}
+    ae = {p.name: {m: v["current_amplitude"] for m, v in p.values.items()} for p in scored}
+    if DEP in ae and len(ae) > 1:
+        drawn["A over E survival"] = partial(roc_figure, ae)
+    if any(name.startswith(f"{IREN.part}.") for name in run.weights):
+        # pulses of both sides of the fullest peak through both networks and back
+        fullest = max(evaluated.sets, key=lambda peak: min(map(len, peak.rows.values())))
+        iren, ren = run.iren, fullest.translations.ren
+        for forward, back, side, names in (
+            (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
+            (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
+        ):
+            start, rows = fullest.windows(side)[:SHOWN], fullest.rows[side][:SHOWN]
+            kev = fullest.translations.energy_kev[side][rows]
+            middle = forward.apply(start, energy_kev=kev, noise=False)
+            end = back.apply(middle, energy_kev=kev, noise=False)
+            stages = dict(zip(names, (start, middle, end), strict=True))
+            name = f"{fullest.name} cycle of {names[0].lower()}"
+            drawn[name] = partial(cycle_figure, stages, ren.dt_ns)
+    if run.records:
+        drawn["losses"] = partial(loss_curves, run.records)
+    return drawn
+
+
+def _of_peak(peak: PeakSets, scores: PeakScores) -> Iterator[tuple[str, Drawing]]:
+    ren, name, values = peak.translations.ren, peak.name, peak.values
+    dt_ns, bins = ren.dt_ns, ren.recipe.scores.max_bins
+    further: dict[str, dict[str, Values]] = {}
+    for parameter, data in values["data"].items():
+        by_method = {m: v[parameter] for m, v in values.items()}
+        if not np.isfinite(data).any():
+            continue
+        if parameter in scores.judged:
+            how = (by_method, data_axis(data, bins), parameter, name, scores.judged[parameter])
+            yield parameter.replace("_", " "), partial(parameter_histograms, *how)
+        else:
+            further[parameter] = by_method
+    yield "further parameters", partial(further_histograms, further, bins, name)
+    rise_time = {method: v["rise_01_90"] for method, v in values.items()}
+    edges, means = sliced(peak.windows, rise_time, dt_ns)
+    whole = {"": {method: of_method[0] for method, of_method in means.items()}}
+    yield "mean pulse", partial(shape_figure, whole, dt_ns, f"{name}: mean pulse")
+    columns = {
+        f"{low:.0f} … {high:.0f} ns": {m: means[m][i] for m in SLICED if m in means}
+        for i, (low, high) in enumerate(pairwise(edges), start=1)
+    }
+    title = f"{name}: superpulses in slices of rise time 1–90 %"
+    yield "superpulses", partial(shape_figure, columns, dt_ns, title)
+    for row in peak.known_to_all():
+        windows = peak.translations.without_noise(row)
+        shapes = {m: around_half(windows[m], dt_ns)[0] for m in SINGLE if m in windows}
+        if all(np.isfinite(shape).any() for shape in shapes.values()):
+            measured = around_half(peak.windows("data"), dt_ns)
+            place, rms = nearest(measured, shapes["ren"])
+            shapes = {"data": measured[place]} | shapes
+            pulses = {m: MeanPulse(s, np.full(len(s), np.nan), 1) for m, s in shapes.items()}
+            title = f"{name}: a simulated pulse without noise, and the measured pulse\n"
+            title += f"nearest to its REN translation (RMS difference {rms:.4f})"
+            yield "single pulse", partial(shape_figure, {"": pulses}, dt_ns, title)
+            break
+    if not scores.noise["data"].missing:
+        noise = {m: scores.noise[m] for m in ("data", "ren")}
+        yield "noise", partial(spectrum_of_noise, noise, name)
