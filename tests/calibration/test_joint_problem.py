@@ -19,8 +19,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.training.chain_fit import Fitter, fit_chain
-from cpunet.training.chain_parameters import with_decay, with_settings
+from cpunet.training.chain_fit import Fitter, fit_chain, with_decay, with_settings
 from cpunet.training.joint import SHRUNK
 from cpunet.training.pulse_sets import PulseSets
 from synthetic import load_recipe

@@ -19,8 +19,8 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.chain_parameters import by_name, vector_of
-from cpunet.training.closed_forms import learned_chain, moved_along_axes, true_chain_of
+from cpunet.training.chain_description import learned_chain, moved_along_axes, true_chain_of
+from cpunet.training.chain_fit import by_name, vector_of
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
 from cpunet.training.verdict import PARTS

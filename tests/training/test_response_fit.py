@@ -15,13 +15,22 @@ from cpunet.electronics.chain import Electronics
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.training import response_fit
-from cpunet.training.chain_fit import POOR, WIDE, Fitter, chi_square, differences, fit_chain
-from cpunet.training.chain_parameters import STRETCH, SmoothParameters, with_decay
+from cpunet.training.chain_fit import (
+    POOR,
+    STRETCH,
+    WIDE,
+    Fitter,
+    SmoothParameters,
+    chi_square,
+    differences,
+    fit_chain,
+    with_decay,
+)
 from cpunet.training.comparison import Difference
 from cpunet.training.joint import SEGMENTS, Joint, SingleSites
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_fit import amplitude_shift, fit_response
-from cpunet.training.verdict import FitInfo
+from cpunet.training.response_fit import fit_response
+from cpunet.training.verdict import FitInfo, amplitude_shift
 from synthetic import load_recipe
 from unpaired import (
     CHAIN,

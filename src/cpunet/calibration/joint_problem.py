@@ -18,9 +18,7 @@ from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
-from cpunet.training.aligned import Basis
-from cpunet.training.chain_fit import Parabola, minimum
-from cpunet.training.chain_parameters import SmoothParameters
+from cpunet.training.chain_fit import Parabola, SmoothParameters, minimum
 from cpunet.training.comparison import NONE, Difference
 from cpunet.training.joint import SHRUNK
 
@@ -265,7 +263,7 @@ class JointProblem:
                 changes.append((moved - windows) / np.float32(step))
             basis = self.chain.basis(padded)
             if len(self.along):
-                basis = Basis(basis.first, np.column_stack([basis.changes, self.modes]))
+                basis = np.column_stack([basis, self.modes])
         differences = []
         for functions in self.here():
             own = [each[functions.sides.rows] for each in changes]

@@ -14,8 +14,8 @@ from __future__ import annotations
 import numpy as np
 
 from cpunet.training.aligned import Aligned, Floats, Values
-from cpunet.training.bands import Sides
 from cpunet.training.joint import SEGMENTS, Joint, gaussian_bins
+from cpunet.training.pulse_sets import Sides
 
 # Bins of the drift time, its slices, and bins of the current amplitude in each: number (half as
 # many for few pulses), ranks of the first and the last, width in units of the spacing, and

@@ -53,7 +53,8 @@ SHORTER_NS, MORE, TRIED = range(320, 3201, 320), 0.01, 1024
 SWAPPED = "are `sim` and `data` swapped?"
 
 
-_REMEDIES = {
+# What to do where pulses are left out for a reason
+REMEDIES = {
     Rejection.NAN: "where NaN pads pulses, continue their last value, or write them again",
     Rejection.CONSTANT: "check that these are the waveforms of a channel that was on",
     Rejection.SATURATED: "select lower energies or another channel",
@@ -67,9 +68,14 @@ _REMEDIES = {
     Rejection.NO_PLATEAU: (
         "give a longer preparation.after_ns: the charge is not collected in time"
     ),
-    Rejection.SECOND_PULSE: "check the rate: another pulse follows in nearly all traces",
+    Rejection.SECOND_PULSE: "check the rate: another pulse follows within the window",
     Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
     Rejection.TAIL_NOT_POSITIVE: "select higher energies",
+    Rejection.TAIL_SLOPE: "tails differ: in-trace pile-up, or pile-up tails",
+    Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info --quality)",
+    Rejection.BASELINE_SLOPE: "baselines are not flat: pile-up tails (cpunet info --quality)",
+    Rejection.CHI2: "tails are no exponentials: pile-up",
+    Rejection.COPIES: "these rows were written twice; write the file anew",
     Rejection.ENERGY_UNKNOWN: (
         "name the column of their calibrated energies (`energy`, `data_energy`), or give "
         "`kev_per_adc`"
@@ -421,7 +427,7 @@ def _nothing_left(
     # of pulses of the wanted energies, if there are any, since these are what is missed
     wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)
     reason = int((wanted if wanted.sum() >= FEW else np.bincount(codes)).argmax())
-    error = CpunetError(text, _REMEDIES[Rejection(reason)])
+    error = CpunetError(text, REMEDIES[Rejection(reason)])
     kev = kev[np.isfinite(kev)]
     if not len(kev):
         calibration = suggested_calibration(amplitudes)

@@ -27,7 +27,7 @@ import scipy.linalg
 
 from cpunet.networks.response_layer import Spectrum
 from cpunet.training.aligned import Aligned, Floats, Values
-from cpunet.training.bands import Sides
+from cpunet.training.pulse_sets import Sides
 
 # Derivatives of aligned pulses, given the heights of their records before, in coordinates of
 # whatever moves these.

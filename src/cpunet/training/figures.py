@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from cpunet.plotting import COLOURS, DATA_FILL, SPARE_COLOURS, label, styled
 from cpunet.pulses.parameters import align_half_maximum
-from cpunet.training.closed_forms import TIMES_NS, Chain, reaches_ns
+from cpunet.training.chain_description import TIMES_NS, Chain, reaches_ns
 
 Floats = npt.NDArray[np.floating]
 

@@ -21,10 +21,16 @@ import scipy.linalg
 from cpunet.networks.by_height import CURVE_KNOTS, LAG_KNOTS, PER_STEP
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.aligned import Aligned, Floats, Values
-from cpunet.training.bands import Sides
-from cpunet.training.chain_fit import Fitted, Parabola, bounded_step, chi_square
-from cpunet.training.chain_parameters import SmoothParameters, with_settings
+from cpunet.training.chain_fit import (
+    Fitted,
+    Parabola,
+    SmoothParameters,
+    bounded_step,
+    chi_square,
+    with_settings,
+)
 from cpunet.training.deviations import SHARED, Linearised, posterior
+from cpunet.training.pulse_sets import Sides
 
 
 class Stage(NamedTuple):

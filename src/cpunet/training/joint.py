@@ -28,9 +28,9 @@ import scipy.linalg
 
 from cpunet.networks.response_layer import Spectrum
 from cpunet.pulses.container import FloatArray
-from cpunet.training.aligned import Aligned, Basis, Changes, Derivatives, Floats, Values
-from cpunet.training.bands import Sides
+from cpunet.training.aligned import Aligned, Changes, Derivatives, Floats, Values
 from cpunet.training.comparison import Difference
+from cpunet.training.pulse_sets import Sides
 
 COMPONENTS, SEGMENTS, BINS = 24, 20, 16
 CLIPPED = 4.0  # robust standard deviations at which components and segments are clipped
@@ -110,7 +110,7 @@ class Joint:
     def difference(
         self,
         transfer: Spectrum,
-        basis: Basis | None = None,
+        basis: Values | None = None,
         changes: Sequence[FloatArray] = (),
     ) -> Difference:
         """Compare the pulses translated by a response, with derivatives if asked.
@@ -120,7 +120,7 @@ class Joint:
         transfer
             Spectrum of the response.
         basis
-            Coordinates of the response; None for no derivatives.
+            Changes of the step response, see `Derivatives`; None for no derivatives.
         changes
             Derivatives of the simulated pulses in other coordinates, which follow.
         """
