@@ -9,12 +9,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from cpunet.networks.response_layer import (
-    LATE_NS,
-    ElectronicsResponse,
-    deviation_lags,
-    padding,
-)
+from cpunet.networks.response_layer import LATE_NS, ElectronicsResponse, deviation_lags, padding
 from cpunet.training.aligned import Derivatives
 from cpunet.training.chain_description import TIMES_NS, learned_chain, reaches_ns, true_chain_of
 from cpunet.training.chain_fit import with_settings
@@ -107,11 +102,7 @@ def test_a_ringing_is_learned_and_its_lack_is_bad(rings):
     assert verdict(found, [sides])[0].good
     # from the half height, since pulses do not tell a delay
     time_ns, steps = np.arange(-50, 1500.0, 4), []
-    for chain in (
-        learned_chain(found, ""),
-        true_chain_of(RINGS),
-        true_chain_of(CHAIN),
-    ):
+    for chain in (learned_chain(found, ""), true_chain_of(RINGS), true_chain_of(CHAIN)):
         half_ns = reaches_ns(chain.step(TIMES_NS), 0.5)
         steps.append(chain.step(time_ns + half_ns) / chain.step(3000.0))
     assert np.abs(steps[0] - steps[1]).max() < 0.002

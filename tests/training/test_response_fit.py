@@ -115,8 +115,7 @@ def test_what_a_fit_tells(near: Told) -> None:
     assert chi_square[-1] == pytest.approx(near.fit.chi_square)
     assert chi_square[-1] < 1.1 * near.fit.moments
     labels = {"log_poles_ns.1", "log_poles_ns.2", "log_decay_us.1", "slow_weights.1"}
-    labels |= {"sharpness.1"}
-    assert set(near.fit.errors) == labels
+    assert set(near.fit.errors) == labels | {"sharpness.1"}
     assert near.response.drift is None
     # those of the mean pulse are as standard deviations: a few are 2, hardly one is 4
     pulls = np.abs(list(near.fit.pulls.values()))
@@ -232,13 +231,8 @@ def test_where_no_chain_is_near_a_fit_leads_no_farther_away(problem: Problem) ->
     time_ns = DT_NS * (np.arange(problem.data.waveforms.shape[1]) - 400)
     wave = np.where((time_ns > 0) & (time_ns < 3000), np.sin(2e-3 * np.pi * time_ns), 0)
     waveforms = problem.data.waveforms + np.float32(0.02) * wave.astype(np.float32)
-    sets = PulseSets(
-        problem.sim,
-        problem.data.with_waveforms(waveforms),
-        problem.noise,
-        RECIPE,
-        np.random.default_rng(0),
-    )
+    both = problem.sim, problem.data.with_waveforms(waveforms)
+    sets = PulseSets(*both, problem.noise, RECIPE, np.random.default_rng(0))
     bands, start = sets.sides(), ElectronicsResponse(RECIPE.matching[0], DT_NS)
     with_decay(start, sets.tail_slope)
     before, _ = chi_square(start, bands, WIDE)

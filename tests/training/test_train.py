@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,19 +12,12 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
+from cpunet.pulses.loading import load_pulses, require_same_sampling
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
-from synthetic import (
-    KEV,
-    SMALL_NETWORK,
-    Files,
-    load_recipe,
-    write_files,
-    write_pulses,
-)
+from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files, write_pulses
 
 RECIPE = load_recipe(
     "published",
@@ -43,13 +37,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     return write_files(tmp_path_factory.mktemp("files"), np.resize(KEV, N))
 
 
-@pytest.fixture
-def sim_set(files) -> InputSet:
+def test_provenance_counts_and_fingerprints_and_other_sampling(files):
     selection = parse_selection("SEP,DEP", RECIPE.peaks)
-    return load_pulses(files[0], "simulated", RECIPE, selection)
-
-
-def test_provenance_counts_and_fingerprints(files, sim_set):
+    sim_set = load_pulses(files[0], "simulated", RECIPE, selection)
     told = sim_set.provenance()
     assert (told.file, told.dt_ns) == (str(files[0].path), 16)
     assert (told.read, told.used) == (N, 2 * N // 3)
@@ -57,13 +47,8 @@ def test_provenance_counts_and_fingerprints(files, sim_set):
     assert told.cuts is None
     content = sim_set.prepared.pulses.waveforms.tobytes()
     assert told.sha256 == hashlib.sha256(content).hexdigest()
-
-
-def test_sets_of_different_sampling(sim_set, files):
-    other = InputSet(
-        sim_set.prepared, 10.0, Path("other.lh5"), sim_set.energies_kev, sim_set.recipe
-    )
     require_same_sampling(sim_set, sim_set)
+    other = replace(sim_set, dt_ns=10.0, path=Path("other.lh5"))
     with pytest.raises(CpunetError) as error:
         require_same_sampling(sim_set, other)
     assert str(error.value) == (
@@ -96,9 +81,10 @@ def test_a_training_tells_what_it_does(files, tmp_path, stages, caplog):
     }
     told = "sim.lh5: 10 of 30 pulses used (left out: 20 energy_"
     assert any(note.startswith(told) for note in caplog.messages)
-    assert Run.load(made.folder).model_dump(exclude={"weights"}) == made.model_dump(
-        exclude={"weights"}
+    again, before = (
+        run.model_dump(exclude={"weights"}) for run in (Run.load(made.folder), made)
     )
+    assert again == before
     assert (made.seed, made.device) == (7, "cpu")
 
 

@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -31,12 +30,7 @@ import scipy.linalg
 from scipy.interpolate import CubicSpline
 from scipy.special import expit
 
-from cpunet.networks.response_layer import (
-    DRAWS,
-    ElectronicsResponse,
-    Spectrum,
-    deviation_lags,
-)
+from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, Spectrum, deviation_lags
 from cpunet.training.aligned import Derivatives, Values
 from cpunet.training.chain_fit import SmoothParameters, with_settings
 from cpunet.training.comparison import MOST, NONE, Comparison, Moved
@@ -122,29 +116,22 @@ STARTS = (
 FURTHER, BETTER = 2, 0.1  # starts that are followed; gain in evidence that counts
 
 
-class Posterior(NamedTuple):
-    """Logarithm of the evidence, and mean of the coordinates."""
-
-    evidence: float
-    mean: Values
-
-
-def posterior(information: Values, right: Values, covariance: Values) -> Posterior:
-    """Evidence of a prior covariance, and what follows for the coordinates.
+def posterior(information: Values, right: Values, covariance: Values) -> tuple[float, Values]:
+    """Logarithm of the evidence of a prior covariance, and mean of the coordinates.
 
     Examples
     --------
     A measurement of 3 ± 1 with a prior of width 1 gives half of it:
 
     >>> unit = np.ones((1, 1))
-    >>> posterior(unit, np.array([3.0]), unit).mean.round(6).tolist()
+    >>> posterior(unit, np.array([3.0]), unit)[1].round(6).tolist()
     [1.5]
     """
     root = np.linalg.cholesky(covariance)
     inner = np.eye(len(root)) + root.T @ information @ root
     factor, g = scipy.linalg.cho_factor(inner), root.T @ right
     z = scipy.linalg.cho_solve(factor, g)
-    return Posterior(float(0.5 * g @ z - np.log(factor[0].diagonal()).sum()), root @ z)
+    return float(0.5 * g @ z - np.log(factor[0].diagonal()).sum()), root @ z
 
 
 def best_prior(
@@ -153,7 +140,7 @@ def best_prior(
     """The prior of the highest evidence, its values changed in turn."""
 
     def of(prior: Prior) -> float:
-        return posterior(information, right, knots.covariance(prior)).evidence
+        return posterior(information, right, knots.covariance(prior))[0]
 
     followed = sorted(((of(prior), i) for i, prior in enumerate(starts)), reverse=True)
     candidates = []
@@ -319,12 +306,9 @@ def _with_amplitude(
     information, right = np.eye(n) / LOOSER, np.zeros(n)
     for sides in bands:
         difference = Joint(sides).difference(transfer, along)
-        whitened = partial(
-            scipy.linalg.solve_triangular, np.linalg.cholesky(difference.covariance), lower=True
-        )
-        slopes = whitened(difference.slopes)
+        values, slopes = difference.white
         information += slopes.T @ slopes
-        right -= slopes.T @ whitened(difference.values)
+        right -= slopes.T @ values
         right += difference.shared
     place = place + modes @ np.linalg.solve(information, right)
     own.set_deviation(knots.between @ place, knots.between @ draws)

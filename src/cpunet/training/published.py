@@ -98,11 +98,10 @@ def import_weights(
         part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
         for part, path in files.items()
     }
-    facts: dict[str, Any] = {"peak": "FEP", "seed": None, "dt_ns": dt_ns, "seconds": 0.0}
-    facts |= {"device": "elsewhere", "sim": UNKNOWN, "data": UNKNOWN, "imported": imported}
-    when = datetime.now(UTC).isoformat(timespec="seconds")
-    facts |= {"imported_at": when, "versions": versions()}
-    run = Run.of(networks, recipe, **facts)
+    facts: dict[str, Any] = {"peak": "FEP", "seed": None, "device": "elsewhere", "seconds": 0.0}
+    facts |= {"dt_ns": dt_ns, "sim": UNKNOWN, "data": UNKNOWN, "imported": imported}
+    facts["imported_at"] = datetime.now(UTC).isoformat(timespec="seconds")
+    run = Run.of(networks, recipe, **facts, versions=versions())
     return run if out is None else run.save(out, force)
 
 

@@ -243,9 +243,7 @@ class Run(InfoPart):
         if tails is None or tails.drawn is None:
             return None
         drawn = TypeAdapter(DrawnTails).validate_python(tails.drawn)
-        if tails.rate_khz > 0:
-            return drawn
-        return replace(drawn, rate_khz=0.0)
+        return drawn if tails.rate_khz > 0 else replace(drawn, rate_khz=0.0)
 
     @cached_property
     def records(self) -> list[Record]:
