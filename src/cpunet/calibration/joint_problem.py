@@ -19,8 +19,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import Parabola, SmoothParameters, minimum
-from cpunet.training.comparison import NONE, Difference
-from cpunet.training.joint import SHRUNK
+from cpunet.training.comparison import NONE, SHRUNK, Difference
 
 # Residual that keeps a step within the reach of the derivatives: its size at the reach.
 HOLD = 4.0
@@ -44,9 +43,10 @@ class JointProblem:
         \mathbf{d} = \langle \mathbf{f} \rangle_{\mathrm{sim}}
         - \langle \mathbf{f} \rangle_{\mathrm{data}},
 
-    where :math:`C` is the covariance of `cpunet.training.joint`, at the start of the problem,
-    and :math:`\mu_i \pm \sigma_i` are the priors.  Parameters of the chain, deviations of its
-    step response and free coordinates of the physics are a vector, in this order.
+    where :math:`C` is the covariance of `cpunet.training.comparison.Joint`, at the start of
+    the problem, and :math:`\mu_i \pm \sigma_i` are the priors.  Parameters of the chain,
+    deviations of its step response and free coordinates of the physics are a vector, in this
+    order.
 
     Parameters
     ----------

@@ -5,7 +5,7 @@ drift time :math:`t`.  Velocities and impurities change its density, above all a
 other components :math:`c_i` and the current amplitude :math:`A` are evaluated in slices of the
 drift time: what depends on it, such as the growth of the charge cloud, is thus distinguished
 from what does not, the readout.  With Gaussian bins :math:`g_k` the functions are those of
-`cpunet.training.joint`, :math:`g_k(t)`, :math:`c_i\, g_k(t)`, and
+`cpunet.training.comparison`, :math:`g_k(t)`, :math:`c_i\, g_k(t)`, and
 :math:`g_j(\ln A)\, g_k(t)`.
 """
 
@@ -14,7 +14,7 @@ from __future__ import annotations
 import numpy as np
 
 from cpunet.training.aligned import Aligned, Floats, Values
-from cpunet.training.joint import SEGMENTS, Joint, gaussian_bins
+from cpunet.training.comparison import SEGMENTS, Joint, gaussian_bins
 from cpunet.training.pulse_sets import Sides
 
 # Bins of the drift time, its slices, and bins of the current amplitude in each: number (half as
@@ -32,7 +32,7 @@ class SlicedJoint(Joint):
     Parameters
     ----------
     sides, wider
-        See `cpunet.training.joint.Joint`.
+        See `cpunet.training.comparison.Joint`.
     band
         Energies of the pulses, if these are several bands.
     """
