@@ -37,13 +37,8 @@ from synthetic import (
 
 DT_NS = 16.0
 # of the run's parameters: log_poles_ns are in the order of the recipe
-ERRORS = {
-    "log_poles_ns.1": 0.02,
-    "log_poles_ns.2": 0.05,
-    "log_decay_us.1": 0.01,
-    "slow_weights.3": 0.004,
-    "decay_weights.1": 0.002,
-}
+ERRORS = {"log_poles_ns.1": 0.02, "log_poles_ns.2": 0.05, "log_decay_us.1": 0.01}
+ERRORS |= {"slow_weights.3": 0.004, "decay_weights.1": 0.002}
 FIT = {"chi_square": 120.0, "moments": 80, "steps": 9, "errors": ERRORS, "pulls": {}}
 
 
@@ -78,22 +73,15 @@ def electronics(**fields: Any) -> Electronics:
         "slow": {"fraction": 0.065, "tau_ns": 400},
         "decays": [{"fraction": 0.96, "tau_us": 80}, {"fraction": 0.04, "tau_us": 4}],
     }
-    return Electronics.model_validate(
-        read_electronics("legend200").model_dump() | changed | fields
-    )
+    whole = read_electronics("legend200").model_dump() | changed | fields
+    return Electronics.model_validate(whole)
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A run that has learned `electronics()` exactly."""
-    return write_response(
-        tmp_path / "run",
-        "generator.poles_ns=[35, 55]",
-        "generator.decay_us=80",
-        slow={2: 0.065},
-        fast={0: 0.04},
-        fit=FIT,
-    )
+    start = "generator.poles_ns=[35, 55]", "generator.decay_us=80"
+    return write_response(tmp_path / "run", *start, slow={2: 0.065}, fast={0: 0.04}, fit=FIT)
 
 
 def values(*runs: Path) -> dict[str, float]:
@@ -129,7 +117,7 @@ def test_noise_is_told_in_kev(tmp_path):
     assert numbers["noise_corner_mhz"] == pytest.approx(8, rel=0.01)
 
 
-def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth(run):
+def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth_and_has_its_errors(run):
     told = response(run, truth=electronics())
     true = told.true_values
     assert true.keys() - told.difference.keys() == {"noise_rms_kev", "noise_corner_mhz"}
@@ -138,10 +126,7 @@ def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth(run):
     assert true["rise_10_90_ns"] == pytest.approx(165, abs=10)
     assert true["noise_rms_kev"] == pytest.approx(1.95, rel=1e-3)
     assert true["noise_corner_mhz"] == pytest.approx(8.5, rel=0.02)
-
-
-def test_errors_go_with_the_poles_they_belong_to(run):
-    (told,) = response(run).runs
+    (told,) = told.runs  # errors go with the poles that they belong to
     assert told.values["pole_1_ns"] == pytest.approx(55)
     assert told.errors == pytest.approx({"pole_1_ns": 0.05 * 55, "pole_2_ns": 0.02 * 35})
     assert told.parameter_errors["decay_us"] == pytest.approx(0.8)
@@ -165,9 +150,8 @@ def test_differences_are_told_in_their_errors(tmp_path):
     (own,), sigma = told.runs, told.sigma
     assert own.values["noise_rms_kev"] == pytest.approx(1.98, rel=2e-3)
     # 2 % of the baselines, and 1 µs of the decay
-    assert own.errors["noise_rms_kev"] == pytest.approx(
-        1.98 * np.hypot(0.02, 1 / 500), rel=0.01
-    )
+    error = 1.98 * np.hypot(0.02, 1 / 500)
+    assert own.errors["noise_rms_kev"] == pytest.approx(error, rel=0.01)
     assert sigma["noise_rms_kev"] == pytest.approx(0.03 / (1.98 * 0.0201), rel=0.1)
     assert sigma["pole_1_ns"] == pytest.approx(1.0, abs=0.02)
     assert set(sigma) == {"noise_rms_kev", "pole_1_ns"}  # parts are degenerate
@@ -211,8 +195,8 @@ def test_the_truth_of_a_stand(run, tmp_path):
     counts = {"n_sim": 1, "n_data": 1, "sim_lines": {}, "data_lines": {}, "flags": {}}
     content = {"electronics": electronics().model_dump(mode="json"), "counts": counts}
     (stand / "stand.json").write_text(json.dumps(content))
-    known = response(run, truth=electronics())
-    assert response(run, truth=stand).true_values == known.true_values
+    known = response(run, truth=electronics()).true_values
+    assert response(run, truth=stand).true_values == known
     assert response(Run.load(run), truth="legend200").truth.name == "legend200"
     (stand / "stand.json").unlink()
     one_line(lambda: response(run, truth=stand), "stand.json: cannot be read")
@@ -279,10 +263,8 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
     assert said.startswith("60 % of the charge would arrive too early")
 
 
-RESPONSE = ElectronicsResponse(
-    load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"]).matching[0],
-    16.0,
-)
+FEW = load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"])
+RESPONSE = ElectronicsResponse(FEW.matching[0], DT_NS)
 
 
 def numbers(response: ElectronicsResponse) -> dict[str, float]:

@@ -106,9 +106,7 @@ def test_the_chain_is_found_and_errors_cover_the_truth(near: Told) -> None:
     # and they are no excuse: the set fixes each within a few percent
     assert max(pole_errors) < 0.1
     assert errors["slow_weights.1"] < 0.002
-
-
-def test_what_a_fit_tells(near: Told) -> None:
+    # what the fit says
     steps, chi_square = zip(*near.steps, strict=True)
     assert steps == tuple(range(1, near.fit.steps + 1))
     assert chi_square[-1] == pytest.approx(near.fit.chi_square)
@@ -181,10 +179,8 @@ def test_derivatives_of_a_fit_are_those_of_differences(problem: Problem) -> None
             parameters.set(place + sign * STEP * width * np.eye(len(place))[i])
             ends.append(differences(parameters, compared).values)
         parameters.set(place)
-        wanted, error = (
-            (ends[0] - ends[1]) / (2 * STEP * width),
-            here.covariance.diagonal() ** 0.5,
-        )
+        wanted = (ends[0] - ends[1]) / (2 * STEP * width)
+        error = here.covariance.diagonal() ** 0.5
         # Levels follow half heights by whole samples, so that a difference of a shift counts
         # the pulses that pass one; the derivative has their mean, and tails are not compared.
         some = slice(SEGMENTS if parameters.labels[i] == STRETCH else 0, None)

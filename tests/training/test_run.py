@@ -114,9 +114,8 @@ def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_f
     record = {"iteration": 1, "rate": 0.1, "losses": {"cycle": 2.0, "gan": 1.0}}
     (run / "losses.jsonl").write_text(json.dumps(record) + "\n")
     known, copy = Run.load(run), tmp_path_factory.mktemp("saved") / "copy"
-    assert known.losses.to_dict("records") == [
-        {"iteration": 1, "rate": 0.1, **record["losses"]}
-    ]
+    flat = {"iteration": 1, "rate": 0.1, **record["losses"]}
+    assert known.losses.to_dict("records") == [flat]
     known.save(copy)
     with pytest.raises(CpunetError, match="exists"):
         known.save(copy)

@@ -19,15 +19,8 @@ from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
 from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files, write_pulses
 
-RECIPE = load_recipe(
-    "published",
-    [
-        *SMALL_NETWORK,
-        "discriminator.samples_per_step=16",
-        "training.iterations=2",
-        "training.batch_size=2",
-    ],
-)
+SMALLER = "discriminator.samples_per_step=16", "training.iterations=2", "training.batch_size=2"
+RECIPE = load_recipe("published", [*SMALL_NETWORK, *SMALLER])
 N = 30
 
 
@@ -74,16 +67,12 @@ def test_devices(monkeypatch):
 def test_a_training_tells_what_it_does(files, tmp_path, stages, caplog):
     caplog.set_level("INFO", "cpunet")
     made = train(*files, tmp_path / "run", recipe=RECIPE, seed=7, device="cpu")
-    assert stages == {
-        "Preparing sim.lh5": [N, N],
-        "Preparing data.lh5": [N, N],
-        "Training": [2, 2],
-    }
+    read = {f"Preparing {side}.lh5": [N, N] for side in ("sim", "data")}
+    assert stages == read | {"Training": [2, 2]}
     told = "sim.lh5: 10 of 30 pulses used (left out: 20 energy_"
     assert any(note.startswith(told) for note in caplog.messages)
-    again, before = (
-        run.model_dump(exclude={"weights"}) for run in (Run.load(made.folder), made)
-    )
+    pair = Run.load(made.folder), made
+    again, before = (run.model_dump(exclude={"weights"}) for run in pair)
     assert again == before
     assert (made.seed, made.device) == (7, "cpu")
 
