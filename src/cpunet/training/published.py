@@ -18,7 +18,7 @@ from cpunet.pulses.loading import SideInfo
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PunetConfig
 from cpunet.settings import flat
-from cpunet.training.run import Run, differing, versions
+from cpunet.training.run import Run, require_alike, versions
 
 # Published layer names → names here.
 LAYERS = (
@@ -151,10 +151,6 @@ def _generator(path: Path, length: int) -> PositionalUNet:
         if block in LAYERS and number.isdecimal():
             layer, rest = block, f"{number}.{rest}"
         named[f"{LAYERS.get(layer, layer)}.{rest}" if layer else name] = value
-    if wrong := differing(named, network.state_dict()):
-        raise CpunetError(
-            f"{path}: weights of another architecture: {len(wrong)} tensors differ, first "
-            f"{wrong[0]}"
-        )
+    require_alike(named, network.state_dict(), path)
     network.load_state_dict(named)
     return network.eval()
