@@ -305,9 +305,12 @@ def _with_amplitude(
     information, right = np.eye(n) / LOOSER, np.zeros(n)
     for sides in bands:
         difference = Joint(sides).difference(transfer, along)
-        values, slopes = difference.white
+        whitened = partial(
+            scipy.linalg.solve_triangular, np.linalg.cholesky(difference.covariance), lower=True
+        )
+        slopes = whitened(difference.slopes)
         information += slopes.T @ slopes
-        right -= slopes.T @ values
+        right -= slopes.T @ whitened(difference.values)
         right += difference.shared
     place = place + modes @ np.linalg.solve(information, right)
     own.set_deviation(knots.between @ place, knots.between @ draws)
