@@ -21,7 +21,7 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulator import Simulator
-from cpunet.training.closed_forms import StepResponse, learned_chain
+from cpunet.training.chain_description import StepResponse, learned_chain
 from cpunet.translation.translator import REN
 
 LENGTH, PLATEAU = 12_000, 10_000  # ns

@@ -20,14 +20,9 @@ DT_NS, N = 16.0, 420
 # of `write_line`: 4000 samples, 20 of 26000 ADC
 POLE_NS, DECAY_US, NOISE_KEV, ADC_PER_KEV = 70.0, 64.0, 2.01, 9.944
 PREPARED = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)  # height of a prepared pulse
-ONE_START = (
-    "generator.poles_ns=[50]",
-    "generator.slow_ns=[]",
-    "generator.fast_decays_us=[]",
-    "training.start_factors=[1]",
-    "training.steps=14",
-)
-RECIPE = load_recipe("fast", ONE_START)
+ONE_POLE = "generator.poles_ns=[50]", "generator.slow_ns=[]", "generator.fast_decays_us=[]"
+ONE_START = "training.start_factors=[1]", "training.steps=14"
+RECIPE = load_recipe("fast", [*ONE_POLE, *ONE_START])
 
 
 @pytest.fixture(scope="module")
@@ -87,14 +82,8 @@ def test_tails_of_earlier_pulses_are_learned_without_being_asked(
     decay = np.exp(-np.arange(whole.length) * DT_NS * 1e-3 / DECAY_US)
     traces = np.round(whole.waveforms + ADC_PER_KEV * left * decay)
     write_pulses(tmp_path / "data.lh5", whole.with_waveforms(traces))
-    made = train(
-        files.sim,
-        PulseFile(tmp_path / "data.lh5"),
-        tmp_path / "run",
-        recipe=RECIPE,
-        seed=3,
-        device="cpu",
-    )
+    data = PulseFile(tmp_path / "data.lh5")
+    made = train(files.sim, data, tmp_path / "run", recipe=RECIPE, seed=3, device="cpu")
     fit = made.fit.model_dump()
     assert fit["chi_square"] < 1.6 * fit["moments"]
     assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)

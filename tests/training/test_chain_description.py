@@ -19,8 +19,8 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.chain_parameters import by_name, vector_of
-from cpunet.training.closed_forms import learned_chain, moved_along_axes, true_chain_of
+from cpunet.training.chain_description import learned_chain, moved_along_axes, true_chain_of
+from cpunet.training.chain_fit import by_name, vector_of
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
 from cpunet.training.verdict import PARTS
@@ -37,13 +37,8 @@ from synthetic import (
 
 DT_NS = 16.0
 # of the run's parameters: log_poles_ns are in the order of the recipe
-ERRORS = {
-    "log_poles_ns.1": 0.02,
-    "log_poles_ns.2": 0.05,
-    "log_decay_us.1": 0.01,
-    "slow_weights.3": 0.004,
-    "decay_weights.1": 0.002,
-}
+ERRORS = {"log_poles_ns.1": 0.02, "log_poles_ns.2": 0.05, "log_decay_us.1": 0.01}
+ERRORS |= {"slow_weights.3": 0.004, "decay_weights.1": 0.002}
 FIT = {"chi_square": 120.0, "moments": 80, "steps": 9, "errors": ERRORS, "pulls": {}}
 
 
@@ -78,22 +73,15 @@ def electronics(**fields: Any) -> Electronics:
         "slow": {"fraction": 0.065, "tau_ns": 400},
         "decays": [{"fraction": 0.96, "tau_us": 80}, {"fraction": 0.04, "tau_us": 4}],
     }
-    return Electronics.model_validate(
-        read_electronics("legend200").model_dump() | changed | fields
-    )
+    whole = read_electronics("legend200").model_dump() | changed | fields
+    return Electronics.model_validate(whole)
 
 
 @pytest.fixture
 def run(tmp_path: Path) -> Path:
     """A run that has learned `electronics()` exactly."""
-    return write_response(
-        tmp_path / "run",
-        "generator.poles_ns=[35, 55]",
-        "generator.decay_us=80",
-        slow={2: 0.065},
-        fast={0: 0.04},
-        fit=FIT,
-    )
+    start = "generator.poles_ns=[35, 55]", "generator.decay_us=80"
+    return write_response(tmp_path / "run", *start, slow={2: 0.065}, fast={0: 0.04}, fit=FIT)
 
 
 def values(*runs: Path) -> dict[str, float]:
@@ -101,9 +89,8 @@ def values(*runs: Path) -> dict[str, float]:
 
 
 def test_a_single_pole_and_a_single_decay(tmp_path):
-    numbers = values(
-        write_response(tmp_path / "a", "generator.poles_ns=[50]", "generator.decay_us=1e6")
-    )
+    one = "generator.poles_ns=[50]", "generator.decay_us=1e6"
+    numbers = values(write_response(tmp_path / "a", *one))
     assert numbers["pole_1_ns"] == pytest.approx(50)
     assert numbers["rise_10_90_ns"] == pytest.approx(50 * np.log(9), rel=1e-3)
     assert numbers["rise_1_99_ns"] == pytest.approx(50 * np.log(99), rel=1e-3)
@@ -124,14 +111,13 @@ def test_noise_is_told_in_kev(tmp_path):
     # aligned at the half rise of poles of 60 and 40 ns, some 80 ns after the step
     height = 0.8 * np.exp((397.5 * DT_NS + 80) / 54_600)
     density = (1.7 * height) ** 2 * shape / mean
-    numbers = values(
-        write_response(tmp_path / "a", "generator.decay_us=54.6", noise_density=density)
-    )
+    decay = "generator.decay_us=54.6"
+    numbers = values(write_response(tmp_path / "a", decay, noise_density=density))
     assert numbers["noise_rms_kev"] == pytest.approx(1.7, rel=5e-3)
     assert numbers["noise_corner_mhz"] == pytest.approx(8, rel=0.01)
 
 
-def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth(run):
+def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth_and_has_its_errors(run):
     told = response(run, truth=electronics())
     true = told.true_values
     assert true.keys() - told.difference.keys() == {"noise_rms_kev", "noise_corner_mhz"}
@@ -140,10 +126,7 @@ def test_a_chain_learned_exactly_differs_in_nothing_from_the_truth(run):
     assert true["rise_10_90_ns"] == pytest.approx(165, abs=10)
     assert true["noise_rms_kev"] == pytest.approx(1.95, rel=1e-3)
     assert true["noise_corner_mhz"] == pytest.approx(8.5, rel=0.02)
-
-
-def test_errors_go_with_the_poles_they_belong_to(run):
-    (told,) = response(run).runs
+    (told,) = told.runs  # errors go with the poles that they belong to
     assert told.values["pole_1_ns"] == pytest.approx(55)
     assert told.errors == pytest.approx({"pole_1_ns": 0.05 * 55, "pole_2_ns": 0.02 * 35})
     assert told.parameter_errors["decay_us"] == pytest.approx(0.8)
@@ -167,20 +150,16 @@ def test_differences_are_told_in_their_errors(tmp_path):
     (own,), sigma = told.runs, told.sigma
     assert own.values["noise_rms_kev"] == pytest.approx(1.98, rel=2e-3)
     # 2 % of the baselines, and 1 µs of the decay
-    assert own.errors["noise_rms_kev"] == pytest.approx(
-        1.98 * np.hypot(0.02, 1 / 500), rel=0.01
-    )
+    error = 1.98 * np.hypot(0.02, 1 / 500)
+    assert own.errors["noise_rms_kev"] == pytest.approx(error, rel=0.01)
     assert sigma["noise_rms_kev"] == pytest.approx(0.03 / (1.98 * 0.0201), rel=0.1)
     assert sigma["pole_1_ns"] == pytest.approx(1.0, abs=0.02)
     assert set(sigma) == {"noise_rms_kev", "pole_1_ns"}  # parts are degenerate
 
 
 def test_the_closed_form_is_the_chain_of_the_stand():
-    config = load_recipe(
-        "fast",
-        ["generator.poles_ns=[55, 35]", "generator.decay_us=80"],
-    ).matching.generator
-    response = ResponseGenerator(config, DT_NS).response
+    chosen = load_recipe("fast", ["generator.poles_ns=[55, 35]", "generator.decay_us=80"])
+    response = ElectronicsResponse(chosen.matching.generator, DT_NS)
     response.slow_weights[2], response.decay_weights[0] = 0.065, 0.04
     chain, truth = learned_chain(response, "run"), electronics()
     time_ns = np.arange(-20.0, 20_000.0, 8.0)
@@ -196,13 +175,8 @@ def test_the_closed_form_is_the_chain_of_the_stand():
 def test_a_folder_with_numbers_and_figure(run, tmp_path):
     out = tmp_path / "out"
     told = response(run, truth=electronics(), out=out)
-    assert {file.name for file in out.iterdir()} == {
-        ".cpunet.json",
-        "response.csv",
-        "response.json",
-        "response.png",
-        "response.yaml",
-    }
+    files = {f"response.{kind}" for kind in ("csv", "json", "png", "yaml")}
+    assert {file.name for file in out.iterdir()} == {".cpunet.json", *files}
     stored = json.loads((out / "response.json").read_text())
     assert stored["runs"][0]["recipe"] == "fast"
     assert stored["runs"][0]["values"] == told.runs[0].values
@@ -221,8 +195,8 @@ def test_the_truth_of_a_stand(run, tmp_path):
     counts = {"n_sim": 1, "n_data": 1, "sim_lines": {}, "data_lines": {}, "flags": {}}
     content = {"electronics": electronics().model_dump(mode="json"), "counts": counts}
     (stand / "stand.json").write_text(json.dumps(content))
-    known = response(run, truth=electronics())
-    assert response(run, truth=stand).true_values == known.true_values
+    known = response(run, truth=electronics()).true_values
+    assert response(run, truth=stand).true_values == known
     assert response(Run.load(run), truth="legend200").truth.name == "legend200"
     (stand / "stand.json").unlink()
     one_line(lambda: response(run, truth=stand), "stand.json: cannot be read")
@@ -278,14 +252,8 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
         return response(run).runs[0].doubts
 
     assert doubts(FIT) == []
-    checks = {
-        "chi_square": 9.0,
-        "amplitude": 1.0,
-        "z": 30.0,
-        "z_ns": 40.0,
-        "beyond_ns": [40.0, 48.0],
-    }
-    checks |= {"off": {"onset": 30.0}, "pulses": [1000, 900]}
+    checks = {"chi_square": 9.0, "amplitude": 1.0, "z": 30.0, "z_ns": 40.0}
+    checks |= {"beyond_ns": [40.0, 48.0], "off": {"onset": 30.0}, "pulses": [1000, 900]}
     (said,) = doubts(FIT | {"verdict": "bad: chi-square is 9", "checks": checks})
     assert said.startswith("the fit is bad: chi-square is 9; ")
     assert said.endswith(PARTS["onset"][1])
@@ -295,10 +263,8 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
     assert said.startswith("60 % of the charge would arrive too early")
 
 
-RESPONSE = ElectronicsResponse(
-    load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"]).matching[0],
-    16.0,
-)
+FEW = load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"])
+RESPONSE = ElectronicsResponse(FEW.matching[0], DT_NS)
 
 
 def numbers(response: ElectronicsResponse) -> dict[str, float]:
@@ -320,59 +286,44 @@ def test_what_is_known_together_has_a_small_error() -> None:
     # a number that is not always defined has no error: along the other axes it is too small
     covariance = np.diag([0.04, 0.04, 1.0, 1.0, 1.0])
     assert [*moved_along_axes(RESPONSE, covariance.tolist(), partly)] == ["sum"]
+    # without a covariance there are no errors
+    for none in ([], [[1.0]], np.full((5, 5), np.nan).tolist()):
+        assert moved_along_axes(RESPONSE, none, numbers) == {}
 
 
-@pytest.mark.parametrize("covariance", [[], [[1.0]], np.full((5, 5), np.nan).tolist()])
-def test_without_a_covariance_there_are_no_errors(covariance: list[list[float]]) -> None:
-    assert moved_along_axes(RESPONSE, covariance, numbers) == {}
-
-
-@pytest.fixture(scope="module")
-def array(tmp_path_factory) -> tuple[Path, list[Path]]:
+def test_a_page_and_tables_of_channels_of_which_one_differs(tmp_path):
     """Channels with small errors of all parameters, one with a pole of its own."""
-    folder, runs = tmp_path_factory.mktemp("array"), []
+    folder, runs = tmp_path / "array", []
     chain = ElectronicsResponse(load_recipe("fast").matching[0], DT_NS)
     errors = np.full(len(vector_of(chain)), 1e-4)
     fit = {"errors": by_name(chain, errors), "covariance": np.diag(errors**2).tolist()}
     for pole in (30.0, 30.5, 29.5, 30.2, 29.8, 60.0):
         setting = f"generator.poles_ns=[45, {pole}]"
-        runs.append(write_response(folder / f"V{len(runs):02d}", setting, fit=fit))
-    response(*runs, out=folder / "array")
-    return folder / "array", runs
-
-
-def test_a_channel_that_differs_comes_first_and_is_marked(array):
-    folder, runs = array
+        runs.append(write_response(tmp_path / f"V{len(runs):02d}", setting, fit=fit))
+    response(*runs, out=folder)
     html = (folder / "response.html").read_text()
     assert "Readouts of 6 channels: 1 to look at" in html
+    assert "late charge [%]" in html
     rows = re.findall(r'<tr><th scope="row">(.*?)</th>(.*?)</tr>', html)
-    assert rows[0][0] == str(runs[5])
-    assert 'class="off"' in rows[0][1]
-    assert not any('class="off"' in cells for _, cells in rows[1:])
-
-
-def test_both_tables_have_the_numbers_of_the_command(array):
-    folder, runs = array
+    assert rows[0][0] == str(runs[5])  # comes first, and is marked
+    assert ['class="off"' in cells for _, cells in rows] == [True] + 5 * [False]
+    # both tables have the numbers of the command
     known = json.loads((folder / "response.json").read_text())["runs"]
     whole = yaml.safe_load((folder / "response.yaml").read_text())
     with (folder / "response.csv").open() as stream:
-        rows = {row["channel"]: row for row in csv.DictReader(stream)}
+        lines = {line["channel"]: line for line in csv.DictReader(stream)}
     for run, numbers in zip(runs, known, strict=True):
         for name, value in numbers["values"].items():
             assert whole[str(run)]["numbers"][name]["value"] == pytest.approx(value)
-            assert float(rows[str(run)][name]) == pytest.approx(value)
-
-
-def test_correlations_are_those_of_the_errors(array):
-    folder, runs = array
-    whole = yaml.safe_load((folder / "response.yaml").read_text())[str(runs[0])]
-    names = whole["correlations"]["names"]
-    matrix = np.array(whole["correlations"]["matrix"])
+            assert float(lines[str(run)][name]) == pytest.approx(value)
+    # correlations are those of the errors
+    names = whole[str(runs[0])]["correlations"]["names"]
+    matrix = np.array(whole[str(runs[0])]["correlations"]["matrix"])
     assert {"rise_10_90_ns", "missing_500_ns", "effective_decay_us"} <= set(names)
     np.testing.assert_allclose(np.diag(matrix), 1, atol=1e-3)
     np.testing.assert_allclose(matrix, matrix.T)
     assert np.abs(matrix).max() <= 1.001
-    assert all(whole["numbers"][name]["error"] > 0 for name in names)
+    assert all(whole[str(runs[0])]["numbers"][name]["error"] > 0 for name in names)
     # what comes late is not there early
     late, later = (names.index(f"missing_{ns}_ns") for ns in (500, 1000))
     assert matrix[late, later] > 0.5

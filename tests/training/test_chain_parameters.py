@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.chain_fit import Parabola, minimum
-from cpunet.training.chain_parameters import SmoothParameters, vector_of
+from cpunet.training.chain_fit import Parabola, SmoothParameters, minimum, vector_of
 from synthetic import load_recipe
 
 DT_NS = 16.0

@@ -57,9 +57,8 @@ def test_no_pulse_is_in_two_bands_and_none_is_far_from_its_own(
     try:
         bands = energy_bands(sim, data, {})
     except CpunetError:
-        assert (
-            min(len(sim), len(data)) < 1.5 * MIN_PULSES
-        )  # the highest ones have no counterpart
+        # the highest ones have no counterpart
+        assert min(len(sim), len(data)) < 1.5 * MIN_PULSES
         return
     # wide bands only where there is no narrower one at all
     both = np.arange(len(sim)), np.arange(len(data))

@@ -12,10 +12,7 @@ import cpunet
 def test_a_slew_rate_is_found_where_there_is_one(tmp_path, slew) -> None:
     settings = [] if slew is None else [f"slew_kev_per_ns={slew}"]
     stand = cpunet.make_stand(
-        tmp_path / "stand",
-        events={"FEP": 1500, "1000-1580": 2500},
-        settings=settings,
-        seed=41,
+        tmp_path / "stand", events={"FEP": 1500, "1000-1580": 2500}, settings=settings, seed=41
     )
     run = cpunet.train(stand.sim, stand.data, tmp_path / "run", peak="FEP,1000-1580")
     assert run.ok

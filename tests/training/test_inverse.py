@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 import pytest
 
@@ -89,28 +87,15 @@ def error(found: np.ndarray, truth: np.ndarray) -> np.ndarray:
     return np.sqrt(((found - truth) ** 2).mean(axis=1))
 
 
-class Case(NamedTuple):
-    generator: ResponseGenerator
-    inverse: LinearInverse
-
-    def iren(self, windows: FloatArray) -> FloatArray:
-        return as_simulated(self.inverse(windows))
-
-
-def fitted(noise_kev: float, energy_kev: float = FEP_KEV) -> Case:
-    generator, sim = readout(noise_kev), charge(1200, seed=1)
-    energies = np.full(len(sim), energy_kev)
-    return Case(generator, fit_inverse(generator, sim, energies, RECIPE, seed=0))
+def fitted(generator: ResponseGenerator) -> LinearInverse:
+    sim = charge(1200, seed=1)
+    return fit_inverse(generator, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
 
 
 @pytest.fixture(scope="module")
-def quiet() -> Case:
-    return fitted(0.0)
-
-
-@pytest.fixture(scope="module")
-def noisy() -> Case:
-    return fitted(NOISE_KEV)
+def noisy() -> tuple[ResponseGenerator, LinearInverse]:
+    generator = readout(NOISE_KEV)
+    return generator, fitted(generator)
 
 
 @pytest.fixture(scope="module")
@@ -118,30 +103,26 @@ def held_out() -> FloatArray:
     return charge(300, seed=2)
 
 
-def test_without_noise_the_charge_comes_back(quiet, held_out):
-    windows = ren(quiet.generator, held_out, None)
-    truth = at_half(held_out)
-    found, measured = error(at_half(quiet.iren(windows)), truth), error(at_half(windows), truth)
-    assert np.median(found) < 1e-4
-    assert np.quantile(found, 0.99) < 0.005
-    assert measured.min() > 0.02
-
-
-def test_a_pulse_keeps_its_place(quiet, held_out):
-    records = quiet.generator(held_out)
-    windows = ren(quiet.generator, held_out, None)
-    found = quiet.inverse(windows)
-    delay = half_time(records) - PADDING_BEFORE - half_time(held_out)
+def test_without_noise_the_charge_comes_back_where_it_was(held_out):
+    quiet = readout(0.0)
+    inverse, windows, truth = fitted(quiet), ren(quiet, held_out, None), at_half(held_out)
+    found = inverse(windows)
+    errors = error(at_half(as_simulated(found)), truth)
+    assert np.median(errors) < 1e-4
+    assert np.quantile(errors, 0.99) < 0.005
+    assert error(at_half(windows), truth).min() > 0.02
+    delay = half_time(quiet(held_out)) - PADDING_BEFORE - half_time(held_out)
     assert np.quantile(np.abs(half_time(windows) - half_time(found) - delay), 0.95) < 0.02
     later = np.concatenate([windows[:, :1], windows[:, :-1]], axis=1)
-    moved = quiet.inverse(later)
+    moved = inverse(later)
     np.testing.assert_allclose(moved[:, 1:], found[:, :-1], atol=1e-3)
 
 
 @pytest.mark.parametrize("kev", [FEP_KEV, DEP_KEV])
 def test_noise_is_taken_away_and_the_edge_is_restored(noisy, held_out, kev):
-    windows = ren(noisy.generator, held_out, kev)
-    found, truth = at_half(noisy.iren(windows)), at_half(held_out)
+    generator, inverse = noisy
+    windows = ren(generator, held_out, kev)
+    found, truth = at_half(as_simulated(inverse(windows))), at_half(held_out)
     measured = at_half(windows)
     # no charge has moved 150 samples before any half maximum of these
     assert truth[:, :50].max() == 0
@@ -164,18 +145,13 @@ def test_coloured_noise_is_known_for_what_it_is(held_out):
     frequency = np.linspace(0, 0.5, NOISE_BINS)
     density = 400 / (1 + (frequency / 0.004) ** 2)  # slower than the edge
     generator.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))
-    sim = charge(1200, seed=1)
-    inverse = fit_inverse(generator, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
-    windows = ren(generator, held_out, FEP_KEV)
-    found = inverse(windows)
-    white = readout(generator.noise.rms)
-    other = fit_inverse(white, sim, np.full(len(sim), FEP_KEV), RECIPE, seed=0)
-    mistaken = other(windows)
-    truth = at_half(held_out)
+    windows, truth = ren(generator, held_out, FEP_KEV), at_half(held_out)
     # of most pulses: noise at half the height may move the alignment of a few by far
-    assert np.median(error(at_half(found), truth)) < 0.85 * np.median(
-        error(at_half(mistaken), truth)
+    right, mistaken = (
+        np.median(error(at_half(fitted(of)(windows)), truth))
+        for of in (generator, readout(generator.noise.rms))
     )
+    assert right < 0.85 * mistaken
 
 
 def test_few_pulses_are_refused():

@@ -72,13 +72,8 @@ def published_forward(state: dict[str, Tensor], pulses: Tensor, epsilon: Tensor)
             layer = f"{name}.double_conv"
             x = F.conv1d(x, state[f"{layer}.{first}.weight"], padding=pad)
             n = f"{layer}.{first + 1}"
-            x = F.batch_norm(
-                x,
-                state[f"{n}.running_mean"],
-                state[f"{n}.running_var"],
-                state[f"{n}.weight"],
-                state[f"{n}.bias"],
-            )
+            parts = "running_mean", "running_var", "weight", "bias"
+            x = F.batch_norm(x, *(state[f"{n}.{part}"] for part in parts))
             x = F.leaky_relu(x, 0.01)
         return x
 

@@ -15,13 +15,21 @@ from cpunet.electronics.chain import Electronics
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.training import response_fit
-from cpunet.training.chain_fit import POOR, WIDE, Fitter, chi_square, differences, fit_chain
-from cpunet.training.chain_parameters import STRETCH, SmoothParameters, with_decay
-from cpunet.training.comparison import Difference
-from cpunet.training.joint import SEGMENTS, Joint, SingleSites
+from cpunet.training.chain_fit import (
+    POOR,
+    STRETCH,
+    WIDE,
+    Fitter,
+    SmoothParameters,
+    chi_square,
+    differences,
+    fit_chain,
+    with_decay,
+)
+from cpunet.training.comparison import SEGMENTS, Difference, Joint, SingleSites
 from cpunet.training.pulse_sets import PulseSets
-from cpunet.training.response_fit import amplitude_shift, fit_response
-from cpunet.training.verdict import FitInfo
+from cpunet.training.response_fit import fit_response
+from cpunet.training.verdict import FitInfo, amplitude_shift
 from synthetic import load_recipe
 from unpaired import (
     CHAIN,
@@ -98,16 +106,13 @@ def test_the_chain_is_found_and_errors_cover_the_truth(near: Told) -> None:
     # and they are no excuse: the set fixes each within a few percent
     assert max(pole_errors) < 0.1
     assert errors["slow_weights.1"] < 0.002
-
-
-def test_what_a_fit_tells(near: Told) -> None:
+    # what the fit says
     steps, chi_square = zip(*near.steps, strict=True)
     assert steps == tuple(range(1, near.fit.steps + 1))
     assert chi_square[-1] == pytest.approx(near.fit.chi_square)
     assert chi_square[-1] < 1.1 * near.fit.moments
     labels = {"log_poles_ns.1", "log_poles_ns.2", "log_decay_us.1", "slow_weights.1"}
-    labels |= {"sharpness.1"}
-    assert set(near.fit.errors) == labels
+    assert set(near.fit.errors) == labels | {"sharpness.1"}
     assert near.response.drift is None
     # those of the mean pulse are as standard deviations: a few are 2, hardly one is 4
     pulls = np.abs(list(near.fit.pulls.values()))
@@ -174,10 +179,8 @@ def test_derivatives_of_a_fit_are_those_of_differences(problem: Problem) -> None
             parameters.set(place + sign * STEP * width * np.eye(len(place))[i])
             ends.append(differences(parameters, compared).values)
         parameters.set(place)
-        wanted, error = (
-            (ends[0] - ends[1]) / (2 * STEP * width),
-            here.covariance.diagonal() ** 0.5,
-        )
+        wanted = (ends[0] - ends[1]) / (2 * STEP * width)
+        error = here.covariance.diagonal() ** 0.5
         # Levels follow half heights by whole samples, so that a difference of a shift counts
         # the pulses that pass one; the derivative has their mean, and tails are not compared.
         some = slice(SEGMENTS if parameters.labels[i] == STRETCH else 0, None)
@@ -223,13 +226,8 @@ def test_where_no_chain_is_near_a_fit_leads_no_farther_away(problem: Problem) ->
     time_ns = DT_NS * (np.arange(problem.data.waveforms.shape[1]) - 400)
     wave = np.where((time_ns > 0) & (time_ns < 3000), np.sin(2e-3 * np.pi * time_ns), 0)
     waveforms = problem.data.waveforms + np.float32(0.02) * wave.astype(np.float32)
-    sets = PulseSets(
-        problem.sim,
-        problem.data.with_waveforms(waveforms),
-        problem.noise,
-        RECIPE,
-        np.random.default_rng(0),
-    )
+    both = problem.sim, problem.data.with_waveforms(waveforms)
+    sets = PulseSets(*both, problem.noise, RECIPE, np.random.default_rng(0))
     bands, start = sets.sides(), ElectronicsResponse(RECIPE.matching[0], DT_NS)
     with_decay(start, sets.tail_slope)
     before, _ = chi_square(start, bands, WIDE)

@@ -57,6 +57,9 @@ def facts(**changes: object) -> str:
     return json.dumps(INFO | {"format": FORMAT} | changes)
 
 
+NO_WEIGHTS = f"{WEIGHTS}: no readable weights; train again"
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -68,17 +71,11 @@ def facts(**changes: object) -> str:
         ("run.json", facts(seed=-1), "run.json: damaged (seed"),
         ("run.json", facts(data={"cuts": 3}), "run.json: damaged (data"),
         ("run.json", facts(fit={"errors": [1]}), "run.json: damaged (fit"),
-        (
-            "run.json",
-            facts(format=FORMAT + 1),
-            f"of another version of cpunet (format {FORMAT + 1}",
-        ),
+        ("run.json", facts(format=FORMAT + 1), "of another version of cpunet (format 4"),
         ("recipe.yaml", None, "recipe.yaml"),
         ("recipe.yaml", "a: [\n", "recipe.yaml"),
         ("recipe.yaml", "name: x", "recipe.yaml"),
-        (WEIGHTS, None, f"{WEIGHTS}: no readable weights; train again"),
-        (WEIGHTS, "", f"{WEIGHTS}: no readable weights; train again"),
-        (WEIGHTS, "PK\x03\x04" + 500 * "\0", f"{WEIGHTS}: no readable weights; train again"),
+        *((WEIGHTS, content, NO_WEIGHTS) for content in (None, "", "PK\x03\x04" + 500 * "\0")),
     ],
 )
 def test_a_damaged_run_is_told(run, name, content, message):
@@ -111,18 +108,14 @@ def test_weights_that_are_no_numbers(run, recipe, change, message):
     one_line(lambda: Run.load(run).fill("ren", blank(recipe)), WEIGHTS, message)
 
 
-def test_a_damaged_log(run):
+def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_factory):
     (run / "losses.jsonl").write_text('{"iteration": 0')
     one_line(lambda: Run.load(run).records, "losses.jsonl: damaged")
-
-
-def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_factory):
     record = {"iteration": 1, "rate": 0.1, "losses": {"cycle": 2.0, "gan": 1.0}}
     (run / "losses.jsonl").write_text(json.dumps(record) + "\n")
     known, copy = Run.load(run), tmp_path_factory.mktemp("saved") / "copy"
-    assert known.losses.to_dict("records") == [
-        {"iteration": 1, "rate": 0.1, **record["losses"]}
-    ]
+    flat = {"iteration": 1, "rate": 0.1, **record["losses"]}
+    assert known.losses.to_dict("records") == [flat]
     known.save(copy)
     with pytest.raises(CpunetError, match="exists"):
         known.save(copy)
@@ -130,15 +123,7 @@ def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_f
         assert (copy / name).read_bytes() == (run / name).read_bytes()
     digest = hashlib.sha256((run / WEIGHTS).read_bytes()).hexdigest()
     assert known.weights_sha256 == digest
-    made = Run.of(
-        model,
-        recipe,
-        peak="FEP",
-        seed=1,
-        dt_ns=16,
-        seconds=1.5,
-        device="cpu",
-    )
+    made = Run.of(model, recipe, peak="FEP", seed=1, dt_ns=16, seconds=1.5, device="cpu")
     assert (made.weights_sha256, made.records) == (digest, [])
     assert repr(made) == "<Run run in memory: published, FEP>"
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -11,29 +12,15 @@ import torch
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.loading import InputSet, load_pulses, require_same_sampling
+from cpunet.pulses.loading import load_pulses, require_same_sampling
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run, resolve_device
 from cpunet.training.train import train
-from synthetic import (
-    KEV,
-    SMALL_NETWORK,
-    Files,
-    load_recipe,
-    write_files,
-    write_pulses,
-)
+from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files, write_pulses
 
-RECIPE = load_recipe(
-    "published",
-    [
-        *SMALL_NETWORK,
-        "discriminator.samples_per_step=16",
-        "training.iterations=2",
-        "training.batch_size=2",
-    ],
-)
+SMALLER = "discriminator.samples_per_step=16", "training.iterations=2", "training.batch_size=2"
+RECIPE = load_recipe("published", [*SMALL_NETWORK, *SMALLER])
 N = 30
 
 
@@ -43,13 +30,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
     return write_files(tmp_path_factory.mktemp("files"), np.resize(KEV, N))
 
 
-@pytest.fixture
-def sim_set(files) -> InputSet:
+def test_provenance_counts_and_fingerprints_and_other_sampling(files):
     selection = parse_selection("SEP,DEP", RECIPE.peaks)
-    return load_pulses(files[0], "simulated", RECIPE, selection)
-
-
-def test_provenance_counts_and_fingerprints(files, sim_set):
+    sim_set = load_pulses(files[0], "simulated", RECIPE, selection)
     told = sim_set.provenance()
     assert (told.file, told.dt_ns) == (str(files[0].path), 16)
     assert (told.read, told.used) == (N, 2 * N // 3)
@@ -57,13 +40,8 @@ def test_provenance_counts_and_fingerprints(files, sim_set):
     assert told.cuts is None
     content = sim_set.prepared.pulses.waveforms.tobytes()
     assert told.sha256 == hashlib.sha256(content).hexdigest()
-
-
-def test_sets_of_different_sampling(sim_set, files):
-    other = InputSet(
-        sim_set.prepared, 10.0, Path("other.lh5"), sim_set.energies_kev, sim_set.recipe
-    )
     require_same_sampling(sim_set, sim_set)
+    other = replace(sim_set, dt_ns=10.0, path=Path("other.lh5"))
     with pytest.raises(CpunetError) as error:
         require_same_sampling(sim_set, other)
     assert str(error.value) == (
@@ -89,16 +67,13 @@ def test_devices(monkeypatch):
 def test_a_training_tells_what_it_does(files, tmp_path, stages, caplog):
     caplog.set_level("INFO", "cpunet")
     made = train(*files, tmp_path / "run", recipe=RECIPE, seed=7, device="cpu")
-    assert stages == {
-        "Preparing sim.lh5": [N, N],
-        "Preparing data.lh5": [N, N],
-        "Training": [2, 2],
-    }
+    read = {f"Preparing {side}.lh5": [N, N] for side in ("sim", "data")}
+    assert stages == read | {"Training": [2, 2]}
     told = "sim.lh5: 10 of 30 pulses used (left out: 20 energy_"
     assert any(note.startswith(told) for note in caplog.messages)
-    assert Run.load(made.folder).model_dump(exclude={"weights"}) == made.model_dump(
-        exclude={"weights"}
-    )
+    pair = Run.load(made.folder), made
+    again, before = (run.model_dump(exclude={"weights"}) for run in pair)
+    assert again == before
     assert (made.seed, made.device) == (7, "cpu")
 
 

@@ -43,7 +43,7 @@ from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed, yaml_text
 from cpunet.simulation.simulate import HitFile, StoredSimulation, simulate
-from cpunet.training.chain_parameters import with_settings
+from cpunet.training.chain_fit import with_settings
 from cpunet.training.job import TrainingJob, train_chain
 from cpunet.training.pulse_sets import MIN_PULSES, PulseSets
 from cpunet.training.run import RUN

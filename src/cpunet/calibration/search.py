@@ -25,8 +25,15 @@ from cpunet.calibration.result import BEYOND_CHANCE, described, of_parts, of_wei
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.recipes.schema import Recipe
-from cpunet.training.chain_fit import POOR, WIDER, Fitter, Parabola, fit_chain
-from cpunet.training.chain_parameters import with_decay, with_settings
+from cpunet.training.chain_fit import (
+    POOR,
+    WIDER,
+    Fitter,
+    Parabola,
+    fit_chain,
+    with_decay,
+    with_settings,
+)
 from cpunet.training.deviations import with_deviations
 from cpunet.training.pulse_sets import PulseSets
 
@@ -179,10 +186,9 @@ class Search:
 
     def _compared(self, wider: float) -> list[SlicedJoint]:
         """Functions of each band, with bins wider by a factor."""
-        names = self.sets.names if len(self._sides) > 1 else [""]
+        several = len(self._sides) > 1
         return [
-            SlicedJoint(sides, wider, name)
-            for sides, name in zip(self._sides, names, strict=True)
+            SlicedJoint(sides, wider, sides.name if several else "") for sides in self._sides
         ]
 
     def _deviated(self, problem: JointProblem, chi_square: float) -> ElectronicsResponse | None:
@@ -196,11 +202,11 @@ class Search:
             return None
         chain = with_settings(problem.response, deviations=False)
         sides = [functions.sides for functions in problem.here()]
-        deviated = with_deviations(chain, sides, lambda _: None)
-        if not deviated.response.config.deviations:
+        response, modes = with_deviations(chain, sides, lambda _: None)
+        if not response.config.deviations:
             return None
-        self._problem = partial(self._problem, modes=deviated.modes)
-        return deviated.response
+        self._problem = partial(self._problem, modes=modes)
+        return response
 
     def _moved(self, nearby: Nearby, moved: Values, free: Sequence[int]) -> Nearby:
         """Pulses at the moved coordinates, with moves limited to `FARTHEST` times the reach."""

@@ -28,8 +28,7 @@ from cpunet.legend.translate_library import known_detector
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.progress import stage
 from cpunet.settings import plain, yaml_text
-from cpunet.training.chain_description import describe_chain
-from cpunet.training.closed_forms import StepResponse
+from cpunet.training.chain_description import StepResponse, describe_chain
 from cpunet.training.response import as_csv, as_yaml
 from cpunet.training.run import RunLike, as_run
 from cpunet.validation.report import METRICS, read_metrics

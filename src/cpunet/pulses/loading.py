@@ -52,16 +52,22 @@ SWAPPED = "are `sim` and `data` swapped?"
 
 
 _OR_PAD = "or allow more preparation.padding_before_ns and padding_after_ns"
-_REMEDIES = {
+# What to do where pulses are left out for a reason
+REMEDIES = {
     Rejection.NAN: "where NaN pads pulses, continue their last value, or write them again",
     Rejection.CONSTANT: "check that these are the waveforms of a channel that was on",
     Rejection.SATURATED: "select lower energies or another channel",
     Rejection.WINDOW_OUTSIDE_RECORD: f"give longer records, {_OR_PAD}",
     Rejection.PULSE_AT_EDGE: f"give records with more before and after the pulse, {_OR_PAD}",
     Rejection.NO_PLATEAU: "give a longer preparation.after_ns: charge is collected later",
-    Rejection.SECOND_PULSE: "check the rate: another pulse follows in nearly all traces",
+    Rejection.SECOND_PULSE: "check the rate: another pulse follows within the window",
     Rejection.NO_AMPLITUDE: "check the polarity and that the traces hold pulses",
     Rejection.TAIL_NOT_POSITIVE: "select higher energies",
+    Rejection.TAIL_SLOPE: "tails differ: in-trace pile-up, or pile-up tails",
+    Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info --quality)",
+    Rejection.BASELINE_SLOPE: "baselines are not flat: pile-up tails (cpunet info --quality)",
+    Rejection.CHI2: "tails are no exponentials: pile-up",
+    Rejection.COPIES: "these rows were written twice; write the file anew",
     Rejection.ENERGY_UNKNOWN: (
         "name the column of calibrated energies (`energy`, `data_energy`) or give `kev_per_adc`"
     ),
@@ -396,7 +402,7 @@ def _nothing_left(
     # of pulses of the wanted energies, if there are any, since these are what is missed
     wanted = np.bincount(codes[codes != Rejection.ENERGY_OUTSIDE_SELECTION], minlength=1)
     reason = int((wanted if wanted.sum() >= FEW else np.bincount(codes)).argmax())
-    error = CpunetError(text, _REMEDIES[Rejection(reason)])
+    error = CpunetError(text, REMEDIES[Rejection(reason)])
     if not len(kev):
         calibration = suggested_calibration(amplitudes)
         like = f"{error}; their amplitudes look like {calibration}"

@@ -16,11 +16,12 @@ import numpy as np
 import numpy.typing as npt
 from scipy.signal import fftconvolve
 
+from cpunet.networks.response_layer import deviation_lags
 from cpunet.pulses.parameters import current_amplitude_kernel
 from cpunet.recipes.schema import MatchingConfig
 
 if TYPE_CHECKING:
-    from cpunet.training.bands import Sides
+    from cpunet.training.pulse_sets import Sides
 
 Values = npt.NDArray[np.float64]
 Floats = npt.NDArray[np.floating[Any]]
@@ -207,24 +208,8 @@ def between(samples: Floats, weights: Values) -> Floats:
     return values
 
 
-@dataclass(frozen=True, eq=False)
-class Basis:
-    """Coordinates in which a step response changes.
-
-    Parameters
-    ----------
-    first
-        First lag after the step in samples; negative.
-    changes
-        Change of the step response from this lag on per coordinate, shape (lags, coordinates).
-    """
-
-    first: int
-    changes: Values
-
-
 class Derivatives:
-    r"""Derivatives in the coordinates of a basis, for pulses with a draw of noise.
+    r"""Derivatives in coordinates in which a step response changes, for pulses with noise.
 
     A record changes by the current at lag l times the change of the response at l.  What is
     read of a pulse changes with its baseline, its height and the time of its half height, too:
@@ -234,7 +219,8 @@ class Derivatives:
     Parameters
     ----------
     basis
-        Coordinates.
+        Change of the step response at `deviation_lags` per coordinate, shape
+        (lags, coordinates).
     sides
         Pulses.
     aligned, heights
@@ -246,14 +232,15 @@ class Derivatives:
         Derivatives of what is read, shape (pulses, coordinates).
     """
 
-    def __init__(self, basis: Basis, sides: Sides, aligned: Aligned, heights: Floats) -> None:
+    def __init__(self, basis: Values, sides: Sides, aligned: Aligned, heights: Floats) -> None:
         self.sides, self.basis = sides, basis
-        self.reversed = basis.changes[::-1].astype(SINGLE)
+        self.lags = deviation_lags(sides.frame.dt_ns)
+        self.reversed = basis[::-1].astype(SINGLE)
         self.values, self.slopes = (sides.view(of) for of in (aligned.pulses, aligned.slopes))
         level = slice(*(sides.frame.before + at for at in sides.frame.level))
         self.level = aligned.pulses[:, level].mean(axis=0)
-        frame, rows, lags = sides.frame, np.arange(len(aligned)), len(basis.changes)
-        last = basis.first + lags - 1
+        frame, rows = sides.frame, np.arange(len(aligned))
+        lags, last = len(basis), int(self.lags[-1])
         height = (aligned.height * heights).astype(SINGLE)[:, np.newaxis]
         weights, _ = cubic(aligned.part)
 
@@ -286,7 +273,7 @@ class Derivatives:
         self.rise = np.where(
             (early > 1)[:, np.newaxis], risen / column(np.maximum(ahead, 1e-5)), 0
         )
-        change = np.zeros((len(aligned), basis.changes.shape[1]), SINGLE)
+        change = np.zeros((len(aligned), basis.shape[1]), SINGLE)
         for step, taps in enumerate(frame.taps):  # of the highest smoothed current
             some = np.flatnonzero(aligned.step == step)
             first = aligned.steepest[some] - last - frame.taps.shape[1] // 2
@@ -297,7 +284,7 @@ class Derivatives:
         self.log_amplitude = change / height / column(np.exp(aligned.log_amplitude))
         self.log_amplitude -= self.span
         self.begin = -frame.before - last
-        length = frame.after - basis.first - self.begin + 3
+        length = frame.after - self.lags[0] - self.begin + 3
         currents = stretch(sides.current, aligned.sample + self.begin - 2, length)
         self.currents = between(currents, weights) / height
 
@@ -312,14 +299,13 @@ class Derivatives:
             Weights of these, shape (pulses, stretches).
         """
         weights = np.asarray(weights, SINGLE)
-        widths, basis = self.sides.widths[:, np.newaxis], self.basis
+        widths = self.sides.widths[:, np.newaxis]
         currents = weights.T @ self.currents[rows]  # (stretches, times)
         sums = np.zeros((len(currents), currents.shape[1] + 1))
         np.cumsum(currents, axis=1, out=sums[:, 1:])
-        lags = basis.first + np.arange(len(basis.changes))
-        low = self.sides.first[:, np.newaxis] - self.sides.frame.before - lags - self.begin
+        low = self.sides.first[:, np.newaxis] - self.sides.frame.before - self.lags - self.begin
         high = np.take_along_axis(sums, low + widths, axis=1)
-        change = ((high - np.take_along_axis(sums, low, axis=1)) / widths) @ basis.changes
+        change = ((high - np.take_along_axis(sums, low, axis=1)) / widths) @ self.basis
         change -= weights.T @ self.base[rows]
         change += (weights * self.slopes[rows]).T @ self.time[rows]
         change -= (weights * self.values[rows]).T @ self.span[rows]
@@ -333,11 +319,9 @@ class Derivatives:
         matrix
             Weights of the stretches, shape (stretches, functions).
         """
-        widths, n, m = self.sides.widths, matrix.shape[1], self.basis.changes.shape[1]
+        widths, n, m = self.sides.widths, matrix.shape[1], self.basis.shape[1]
         weights = np.repeat(matrix / widths[:, np.newaxis], widths, axis=0)
-        kernel = fftconvolve(
-            weights[:, :, np.newaxis], self.basis.changes[::-1, np.newaxis], axes=0
-        )
+        kernel = fftconvolve(weights[:, :, np.newaxis], self.basis[::-1, np.newaxis], axes=0)
         changes = self.currents @ kernel.reshape(-1, n * m).astype(SINGLE)
         change = changes.reshape(-1, n, m)
         matrix = matrix.astype(SINGLE)

@@ -25,6 +25,7 @@ from cpunet.outputs import refuse_picture, written_aside
 from cpunet.pulses.channels import Pair, paired
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.loading import (
+    REMEDIES,
     InputSet,
     load_pulses,
     require_both_sides,
@@ -124,17 +125,15 @@ class CheckResult:
 
         if not self.sides:
             raise CpunetError("no pulses of both sides to draw")
-        names = {"data": "data", "raw": "sim"}  # names in figures, the measured side first
-        dt_ns = self.sides["data"].dt_ns
-        pulses = {name: _of_height_one(self.sides[side]) for name, side in names.items()}
+        sides = {"data": self.sides["data"], "raw": self.sides["sim"]}  # names in figures
+        dt_ns = sides["data"].dt_ns
+        pulses = {name: _of_height_one(side) for name, side in sides.items()}
         rises = {name: _rise_ns(of, dt_ns) for name, of in pulses.items()}
         amplitudes = {name: current_amplitude(of, dt_ns) for name, of in pulses.items()}
-        return sides_figure(
-            pulses,
-            {"Time from 10 to 50 % [ns]": rises, "Current amplitude [1/sample]": amplitudes},
-            dt_ns,
-            {name: len(self.sides[side].prepared) for name, side in names.items()},
-        )
+        quantities = {"Time from 10 to 50 % [ns]": rises}
+        quantities["Current amplitude [1/sample]"] = amplitudes
+        counts = {name: len(side.prepared) for name, side in sides.items()}
+        return sides_figure(pulses, quantities, dt_ns, counts)
 
     def save(self, path: str | Path, force: bool = False) -> None:
         """Draw the pulses of both sides into a file, see `plot`.
@@ -234,7 +233,7 @@ def check(
 def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult:
     """Read both sides as in a training, and compare them."""
     if isinstance(pair, CpunetError):
-        return CheckResult([_judged(pair.text, pair.remedy, fine=False, other=True)])
+        return CheckResult([Finding(Level.ERROR, pair.text, pair.remedy)])
     selection, findings = parse_selection(peak, recipe.peaks), list[Finding]()
     sets: dict[str, InputSet] = {}
     kinds: tuple[tuple[str, Kind], ...] = (("data", "measured"), ("sim", "simulated"))
@@ -244,41 +243,10 @@ def _checked(pair: Pair | CpunetError, recipe: Recipe, peak: str) -> CheckResult
             sets[side] = load_pulses(file, kind, recipe, selection, **how)
             recipe = sets[side].recipe
         except CpunetError as error:
-            findings.append(_judged(error.text, error.remedy, fine=False, other=True))
+            findings.append(Finding(Level.ERROR, error.text, error.remedy))
     if len(sets) == 2:
         findings += compare_sides(sets["sim"], sets["data"], selection, recipe.preparation)
     return CheckResult(findings, sets if len(sets) == 2 else {})
-
-
-def compare_sides(
-    sim: InputSet, data: InputSet, selection: EnergySelection, preparation: PreparationConfig
-) -> list[Finding]:
-    """Compare two prepared sets."""
-    findings = []
-    try:  # without these a training raises an error
-        require_same_sampling(sim, data)
-        findings.append(Finding(Level.FINE, f"every {data.dt_ns:g} ns"))
-        notes = require_both_sides(sim, data, selection)
-        findings += [Finding(Level.WARNING, note) for note in notes]
-    except CpunetError as error:
-        return [*findings, _judged(error.text, error.remedy, fine=False, other=True)]
-    findings += (too_short := _too_short(sim, preparation))
-    for inputs, side in ((sim, "simulated"), (data, "measured")):
-        findings += _of_side(inputs, side, selection, shares=not too_short)
-    if min(len(sim.prepared), len(data.prepared)) < MIN_PULSES:
-        return findings  # too few to compare shapes
-    if not too_short:
-        findings.append(_spread(sim, data))
-    # no readout increases current amplitudes much
-    amplitudes = (current_amplitude(_of_height_one(of), of.dt_ns) for of in (sim, data))
-    simulated, measured = (float(np.nanquantile(of, 0.9)) for of in amplitudes)
-    ratio = measured / simulated
-    text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
-    remedy = (
-        "electronics cannot make pulses sharper: another detector, too wide a cloud, or other "
-        "energies"
-    )
-    return [*findings, _judged(text, remedy, ratio < SHARPER, ratio > OTHER_SHARPER)]
 
 
 def _judged(text: str, remedy: str, fine: bool, other: bool = False) -> Finding:
@@ -288,42 +256,32 @@ def _judged(text: str, remedy: str, fine: bool, other: bool = False) -> Finding:
     return Finding(Level.ERROR if other else Level.WARNING, text, remedy)
 
 
-LONGER = (
-    "write longer ones, or allow more padding (preparation.padding_before_ns, padding_after_ns "
-    "in `settings`)"
-)
-REMEDIES = {
-    Rejection.SATURATED: "saturated traces have lost their top; choose lower energies",
-    Rejection.WINDOW_OUTSIDE_RECORD: f"the traces are shorter than the window; {LONGER}",
-    Rejection.PULSE_AT_EDGE: f"the traces end too soon before or after the pulse; {LONGER}",
-    Rejection.NO_PLATEAU: (
-        "pulses still rise long after half of their height: drift is longer than the window; "
-        "lengthen it (preparation.after_ns in `settings`)"
-    ),
-    Rejection.SECOND_PULSE: "another pulse follows within the window: in-trace pile-up",
-    Rejection.TAIL_SLOPE: "tails differ: in-trace pile-up, or pile-up tails",
-    Rejection.BASELINE: "baselines differ: pile-up tails (cpunet info --quality)",
-    Rejection.BASELINE_SLOPE: "baselines are not flat: pile-up tails (cpunet info --quality)",
-    Rejection.CHI2: "tails are no exponentials: pile-up",
-    Rejection.COPIES: "these rows were written twice; write the file anew",
-    Rejection.NO_AMPLITUDE: "the polarity may be reversed, or these are noise",
-}
-
-
-def _too_short(sim: InputSet, preparation: PreparationConfig) -> list[Finding]:
-    """Warn if simulated pulses reach into the baseline or the tail of a window."""
-    findings = list[Finding]()
-    if preparation.align_at != "half_height":
-        return findings
-    waveforms, at = _of_height_one(sim), preparation.at(sim.dt_ns).samples_before
-    begin = at - (waveforms > BEGUN).argmax(axis=1)
-    end = waveforms.shape[1] - (waveforms[:, ::-1] < 1 - BEGUN).argmax(axis=1) - at
+def compare_sides(
+    sim: InputSet, data: InputSet, selection: EnergySelection, preparation: PreparationConfig
+) -> Iterator[Finding]:
+    """Compare two prepared sets."""
+    try:  # without these a training raises an error
+        require_same_sampling(sim, data)
+        yield Finding(Level.FINE, f"every {data.dt_ns:g} ns")
+        for note in require_both_sides(sim, data, selection):
+            yield Finding(Level.WARNING, note)
+    except CpunetError as error:
+        yield Finding(Level.ERROR, error.text, error.remedy)
+        return
+    simulated, measured = _of_height_one(sim), _of_height_one(data)
+    too_short = False
+    # simulated pulses that reach into the baseline or the tail of a window
+    at = preparation.at(sim.dt_ns).samples_before
+    begin = at - (simulated > BEGUN).argmax(axis=1)
+    end = simulated.shape[1] - (simulated[:, ::-1] < 1 - BEGUN).argmax(axis=1) - at
     for where, what, samples, window_ns, taken_ns in (
         ("before", "begin", begin, preparation.before_ns, preparation.baseline_ns),
         ("after", "rise", end, preparation.after_ns, preparation.decay_fit_ns),
     ):
         longest_ns = float(np.quantile(samples, LONGEST)) * sim.dt_ns
-        if longest_ns > (room_ns := window_ns - taken_ns):
+        room_ns = window_ns - taken_ns
+        if preparation.align_at == "half_height" and longest_ns > room_ns:
+            too_short = True
             text = (
                 f"the window is shorter than the drift: pulses {what} up to "
                 f"{longest_ns:.0f} ns {where} half of their height, for which it has "
@@ -331,17 +289,31 @@ def _too_short(sim: InputSet, preparation: PreparationConfig) -> list[Finding]:
             )
             wanted = 100 * math.ceil((window_ns + longest_ns - room_ns) / 100)
             remedy = f"preparation.{where}_ns={wanted} in `settings`"
-            findings.append(Finding(Level.WARNING, text, remedy))
-    return findings
+            yield Finding(Level.WARNING, text, remedy)
+    # pulses in their own baselines would be blamed on others
+    for inputs, side in ((sim, "simulated"), (data, "measured")):
+        yield from _of_side(inputs, side, selection, shares=not too_short)
+    if min(len(sim.prepared), len(data.prepared)) < MIN_PULSES:
+        return  # too few to compare shapes
+    if not too_short:
+        yield _spread(simulated, measured, sim.dt_ns)
+    # no readout increases current amplitudes much
+    ratio = float(
+        np.nanquantile(current_amplitude(measured, data.dt_ns), 0.9)
+        / np.nanquantile(current_amplitude(simulated, sim.dt_ns), 0.9)
+    )
+    text = f"measured current amplitudes are {ratio:.2f} of the simulated ones"
+    remedy = (
+        "electronics cannot make pulses sharper: another detector, too wide a cloud, or other "
+        "energies"
+    )
+    yield _judged(text, remedy, ratio < SHARPER, ratio > OTHER_SHARPER)
 
 
 def _of_side(
     inputs: InputSet, side: str, selection: EnergySelection, *, shares: bool
 ) -> Iterator[Finding]:
-    """Check number and energies of the pulses of a side, and what is left out of them.
-
-    Without `shares`, since pulses in their own baselines would be blamed on others.
-    """
+    """Check number and energies of the pulses of a side, and the `shares` left out of them."""
     name, n = inputs.path.name, len(inputs.prepared)
     text = f"{name}: {n} {side} pulses of {inputs.prepared.n_read} can be used"
     remedy = f"{FEW} or more are better: a file of more events, or more energies (`peak`)"
@@ -349,8 +321,7 @@ def _of_side(
     # the highest gamma line has no neighbours
     highest = sorted(selection.peaks.items(), key=lambda item: item[1].energy_kev)[-1:]
     for label, line in highest:
-        line_kev = line_near(inputs.energies_kev, line.energy_kev)
-        if line_kev is None:
+        if (line_kev := line_near(inputs.energies_kev, line.energy_kev)) is None:
             continue
         off, factor = line_kev - line.energy_kev, line.energy_kev / line_kev
         text = f"{name}: line {label} of the {side} pulses at {line_kev:.1f} keV"
@@ -369,13 +340,12 @@ def _of_side(
             yield Finding(Level.WARNING, f"{name}: {part}", remedy)
 
 
-def _spread(sim: InputSet, data: InputSet) -> Finding:
+def _spread(waveforms: FloatArray, data: FloatArray, dt_ns: float) -> Finding:
     """Compare the spreads of the drift times, behind a readout as slow as that of the data.
 
     A readout adds nearly the same time to long rises, and hides differences of short ones.
     """
-    dt_ns, waveforms = sim.dt_ns, _of_height_one(sim)
-    measured, simulated = _rise_ns(_of_height_one(data), dt_ns), _rise_ns(waveforms, dt_ns)
+    measured, simulated = _rise_ns(data, dt_ns), _rise_ns(waveforms, dt_ns)
     median_ns = float(np.median(measured))
     if np.median(simulated) < median_ns:  # then behind a Gaussian response of this median
         slowed = partial(gaussian_filter1d, waveforms, axis=1, mode="nearest")

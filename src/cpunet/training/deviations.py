@@ -23,7 +23,6 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple
 
 import numpy as np
 import scipy.fft
@@ -31,17 +30,11 @@ import scipy.linalg
 from scipy.interpolate import CubicSpline
 from scipy.special import expit
 
-from cpunet.networks.response_layer import (
-    DRAWS,
-    ElectronicsResponse,
-    Spectrum,
-    deviation_lags,
-)
-from cpunet.training.aligned import Basis, Derivatives, Values
-from cpunet.training.bands import Sides
-from cpunet.training.chain_parameters import SmoothParameters, with_settings
-from cpunet.training.comparison import MOST, NONE, Comparison, Moved
-from cpunet.training.joint import Joint
+from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, Spectrum, deviation_lags
+from cpunet.training.aligned import Derivatives, Values
+from cpunet.training.chain_fit import SmoothParameters, with_settings
+from cpunet.training.comparison import NONE, Comparison, Joint, Moved
+from cpunet.training.pulse_sets import MOST, Sides
 
 # Knots in ns: the last of the dense ones and of all, and their spacing.
 DENSE_NS, LAST_NS, APART_NS, SPARSE_NS, GROWTH = 3000.0, 6800.0, 8.0, 96.0, 1.12
@@ -122,29 +115,22 @@ STARTS = (
 FURTHER, BETTER = 2, 0.1  # starts that are followed; gain in evidence that counts
 
 
-class Posterior(NamedTuple):
-    """Logarithm of the evidence, and mean of the coordinates."""
-
-    evidence: float
-    mean: Values
-
-
-def posterior(information: Values, right: Values, covariance: Values) -> Posterior:
-    """Evidence of a prior covariance, and what follows for the coordinates.
+def posterior(information: Values, right: Values, covariance: Values) -> tuple[float, Values]:
+    """Logarithm of the evidence of a prior covariance, and mean of the coordinates.
 
     Examples
     --------
     A measurement of 3 ± 1 with a prior of width 1 gives half of it:
 
     >>> unit = np.ones((1, 1))
-    >>> posterior(unit, np.array([3.0]), unit).mean.round(6).tolist()
+    >>> posterior(unit, np.array([3.0]), unit)[1].round(6).tolist()
     [1.5]
     """
     root = np.linalg.cholesky(covariance)
     inner = np.eye(len(root)) + root.T @ information @ root
     factor, g = scipy.linalg.cho_factor(inner), root.T @ right
     z = scipy.linalg.cho_solve(factor, g)
-    return Posterior(float(0.5 * g @ z - np.log(factor[0].diagonal()).sum()), root @ z)
+    return float(0.5 * g @ z - np.log(factor[0].diagonal()).sum()), root @ z
 
 
 def best_prior(
@@ -153,7 +139,7 @@ def best_prior(
     """The prior of the highest evidence, its values changed in turn."""
 
     def of(prior: Prior) -> float:
-        return posterior(information, right, knots.covariance(prior)).evidence
+        return posterior(information, right, knots.covariance(prior))[0]
 
     followed = sorted(((of(prior), i) for i, prior in enumerate(starts)), reverse=True)
     candidates = []
@@ -212,7 +198,7 @@ class Knots:
         # beyond the last knot a deviation decays with the chain
         self.between[~inside, -1] = base[~inside] / base[last - lags[0]]
         parameters = SmoothParameters(response)
-        changes = parameters.basis(padded).changes
+        changes = parameters.basis(padded)
         # half a sample of delay, and a variance of a sample squared, of either sign
         slope = np.gradient(base)
         others = 0.5 * slope, 0.5 * np.gradient(slope)
@@ -224,27 +210,9 @@ class Knots:
         return np.asarray(prior.covariance(self.time_ns) + self.tangents @ self.tangents.T)
 
 
-class Deviated(NamedTuple):
-    """A response with its deviations, and what they gain.
-
-    Parameters
-    ----------
-    response
-        The chain with deviations; the chain itself if they gain nothing.
-    evidence
-        Logarithm of the evidence of deviations, where they were first tried.
-    modes
-        Deviations of unit prior variance that the pulses determine, shape (lags, modes).
-    """
-
-    response: ElectronicsResponse
-    evidence: float
-    modes: Values = NONE
-
-
 def with_deviations(
     response: ElectronicsResponse, bands: Sequence[Sides], count: Callable[[float], None]
-) -> Deviated:
+) -> tuple[ElectronicsResponse, Values]:
     """Deviations of a chain that has been fitted.
 
     Parameters
@@ -255,17 +223,22 @@ def with_deviations(
         Pulses of both sides, whose simulation has passed any stretch of the drift.
     count
         Called with chi-square after each step.
+
+    Returns
+    -------
+    tuple
+        The chain with deviations, or the chain itself if they gain nothing; deviations of unit
+        prior variance that the pulses determine, shape (lags, modes).
     """
     padded, frame = bands[0].padded, bands[0].frame
     knots = Knots(response, padded)
     own = with_settings(response, deviations=True)
-    basis = Basis(int(knots.lags[0]), knots.between)
     inside = (knots.lags >= frame.level[0]) & (knots.lags < frame.level[1])
     gauge = knots.between[inside].mean(axis=0)
-    place, prior, first = np.zeros(len(knots.time_ns)), STARTS[0], None
+    place, prior, begun = np.zeros(len(knots.time_ns)), STARTS[0], False
     for width, most, gain in STAGES:
-        of_step = partial(Derivatives, basis)
-        problem = Linearised([side.of(most) for side in bands], of_step, width)
+        some = [side.of(most) for side in bands]
+        problem = Linearised(some, partial(Derivatives, knots.between), width)
         before, far, halved = (np.inf, place), True, 0
         for _ in range(STEPS):
             own.set_deviation(knots.between @ place)
@@ -279,32 +252,31 @@ def with_deviations(
             gained, before, halved = before[0] - cost, (cost, place), 0
             information = problem.information + GAUGE * np.outer(gauge, gauge)
             if far:
-                starts = STARTS if first is None else [prior]
+                starts = [prior] if begun else STARTS
                 prior = best_prior(information, problem.right, knots, starts)
             covariance = knots.covariance(prior)
             evidence, new = posterior(information, problem.right, covariance)
-            if first is None and evidence < 0:
-                return Deviated(response, evidence)
-            first = evidence if first is None else first
+            if not begun and evidence < 0:
+                return response, NONE
+            begun = True
             largest = np.abs(knots.between @ (new - place)).max()
             place = place + (move := (new - place) * min(1.0, LARGEST / largest))
             size = float(np.sqrt(move @ problem.information @ move))
             far = size > CLOSE
             if size < SETTLED or gained < gain * cost:
                 break
-    if first is None:
-        return Deviated(response, -np.inf)
+    if not begun:
+        return response, NONE
     own.set_deviation(knots.between @ place)
     cost = problem.evaluate(own.transfer(padded), place, anew=False)
     if not cost <= before[0]:
         cost, place = before
     alone = problem.evaluate(response.transfer(padded), 0 * place, anew=False)
     if not cost < alone:
-        return Deviated(response, first)
+        return response, NONE
     own.set_deviation(knots.between @ place)
     both = information, problem.information
-    modes = _with_amplitude(own, bands, knots, place, both, covariance)
-    return Deviated(own, first, modes)
+    return own, _with_amplitude(own, bands, knots, place, both, covariance)
 
 
 def _with_amplitude(
@@ -329,8 +301,7 @@ def _with_amplitude(
     normal = np.random.default_rng(0).standard_normal((len(root), DRAWS)) / np.sqrt(DRAWS)
     draws = root @ scipy.linalg.solve_triangular(inner.T, SHARED * normal)
 
-    along = Basis(int(knots.lags[0]), knots.between @ modes)
-    transfer, n = own.transfer(bands[0].padded), modes.shape[1]
+    along, transfer, n = knots.between @ modes, own.transfer(bands[0].padded), modes.shape[1]
     information, right = np.eye(n) / LOOSER, np.zeros(n)
     for sides in bands:
         difference = Joint(sides).difference(transfer, along)

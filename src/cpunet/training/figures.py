@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from cpunet.plotting import COLOURS, DATA_FILL, SPARE_COLOURS, label, styled
 from cpunet.pulses.parameters import align_half_maximum
-from cpunet.training.closed_forms import TIMES_NS, Chain, reaches_ns
+from cpunet.training.chain_description import TIMES_NS, Chain, reaches_ns
 
 Floats = npt.NDArray[np.floating]
 
@@ -132,13 +132,11 @@ def response_figure(
         panels["noise"].loglog(frequency, density, **look)
     if truth is not None:
         axes, reference = panels["residual"], steps.pop(0)
-        for i, step in enumerate(steps):
-            difference, band = 1e3 * (step - reference), 1e3 * errors[i + 1]
-            colour = shades[i % len(shades)]
+        for (_, colour, _), step, error in zip(drawn[1:], steps, errors[1:], strict=True):
+            difference, band = 1e3 * (step - reference), 1e3 * error
             axes.plot(long_ns, difference, color=colour)
-            axes.fill_between(
-                long_ns, difference - band, difference + band, color=colour, alpha=0.3
-            )
+            around = difference - band, difference + band
+            axes.fill_between(long_ns, *around, color=colour, alpha=0.3)
         axes.axhline(0, color="black", linewidth=0.8)
         axes.set(ylabel="Run − truth\n[10⁻³ of full charge]")
     _annotate(panels)

@@ -21,10 +21,16 @@ import scipy.linalg
 from cpunet.networks.by_height import CURVE_KNOTS, LAG_KNOTS, PER_STEP
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.training.aligned import Aligned, Floats, Values
-from cpunet.training.bands import Sides
-from cpunet.training.chain_fit import Fitted, Parabola, bounded_step, chi_square
-from cpunet.training.chain_parameters import SmoothParameters, with_settings
+from cpunet.training.chain_fit import (
+    Fitted,
+    Parabola,
+    SmoothParameters,
+    bounded_step,
+    chi_square,
+    with_settings,
+)
 from cpunet.training.deviations import SHARED, Linearised, posterior
+from cpunet.training.pulse_sets import Sides
 
 
 class Stage(NamedTuple):
@@ -115,9 +121,15 @@ def with_heights(
     starts = []
     for limited in False, True:  # a slew rate makes up for a curve, and a curve for a slew rate
         start = copy.deepcopy(own)
+        assert start.by_height is not None
         few = [sides.of(FEW).entering(start) for sides in fitted]
-        if limited:
-            _limit(start, few)
+        if limited:  # the best of a few: far from it, pulses are not linear in a slew rate
+            at, costs = np.arange(1, LAG_KNOTS) / PER_STEP, list[float]()
+            lags = [np.log(at / limit / np.tanh(at / limit)) for limit in LIMITS]
+            for lag in lags:
+                start.by_height.lag[1:] = lag
+                costs.append(chi_square(start, few, FIRST[0].width)[0])
+            start.by_height.lag[1:] = lags[int(np.argmin(costs))]
         for stage in FIRST:
             _solve(start, few, stage, count)
         starts.append((chi_square(start, fitted)[0], start))
@@ -165,19 +177,6 @@ class Unknowns:
         self.by_height.set(vector[self.n :])
 
 
-def _limit(own: ElectronicsResponse, bands: Sequence[Sides]) -> None:
-    """Go to the slew rate of the least chi-square; far from it, pulses are not linear in it."""
-    at = np.arange(1, LAG_KNOTS) / PER_STEP
-    by_height, costs = own.by_height, list[float]()
-    assert by_height is not None
-    rates = [np.log(at / limit / np.tanh(at / limit)) for limit in LIMITS]
-    by_height.curve[:] = 0
-    for rate in rates:
-        by_height.lag[1:] = rate
-        costs.append(chi_square(own, bands, FIRST[0].width)[0])
-    by_height.lag[1:] = rates[int(np.argmin(costs))]
-
-
 def _solve(
     own: ElectronicsResponse,
     bands: Sequence[Sides],
@@ -210,7 +209,7 @@ def _solve(
             start, evidence = right - problem.information @ unknowns.centre, {}
             for choice in product(LAGS, CURVES):
                 prior = unknowns.covariance(*choice)
-                evidence[choice] = posterior(problem.information, start, prior).evidence
+                evidence[choice] = posterior(problem.information, start, prior)[0]
             best = max(evidence, key=lambda choice: evidence[choice])
             precision = np.linalg.inv(unknowns.covariance(*best))
         cost += of_prior(place)

@@ -18,7 +18,7 @@ from cpunet.pulses.loading import SideInfo
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PunetConfig
 from cpunet.settings import flat
-from cpunet.training.run import Run, differing, versions
+from cpunet.training.run import Run, require_alike, versions
 
 # Published layer names → names here.
 LAYERS = (
@@ -98,11 +98,10 @@ def import_weights(
         part: {"file": str(path), "sha256": hashlib.sha256(path.read_bytes()).hexdigest()}
         for part, path in files.items()
     }
-    facts: dict[str, Any] = {"peak": "FEP", "seed": None, "dt_ns": dt_ns, "seconds": 0.0}
-    facts |= {"device": "elsewhere", "sim": UNKNOWN, "data": UNKNOWN, "imported": imported}
-    when = datetime.now(UTC).isoformat(timespec="seconds")
-    facts |= {"imported_at": when, "versions": versions()}
-    run = Run.of(networks, recipe, **facts)
+    facts: dict[str, Any] = {"peak": "FEP", "seed": None, "device": "elsewhere", "seconds": 0.0}
+    facts |= {"dt_ns": dt_ns, "sim": UNKNOWN, "data": UNKNOWN, "imported": imported}
+    facts["imported_at"] = datetime.now(UTC).isoformat(timespec="seconds")
+    run = Run.of(networks, recipe, **facts, versions=versions())
     return run if out is None else run.save(out, force)
 
 
@@ -152,10 +151,6 @@ def _generator(path: Path, length: int) -> PositionalUNet:
         if block in LAYERS and number.isdecimal():
             layer, rest = block, f"{number}.{rest}"
         named[f"{LAYERS.get(layer, layer)}.{rest}" if layer else name] = value
-    if wrong := differing(named, network.state_dict()):
-        raise CpunetError(
-            f"{path}: weights of another architecture: {len(wrong)} tensors differ, first "
-            f"{wrong[0]}"
-        )
+    require_alike(named, network.state_dict(), path)
     network.load_state_dict(named)
     return network.eval()

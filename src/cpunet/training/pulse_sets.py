@@ -4,26 +4,34 @@ Lines and continua have different mixtures of single-site and multi-site events,
 scales as 1/energy.  Pulses of a line are therefore compared with those of the same line, and a
 continuum is compared in bands narrow enough for a constant mixture.  If the spectra of the two
 sides differ within such a band, the simulated pulses are weighted to match the data.
+
+A fit compares many responses.  All of them have the same noise, drawn once, so that their
+differences are those of the responses.
 """
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
+import scipy.fft
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.drawn_pile_up import DrawnTails
+from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
-from cpunet.networks.response_layer import record_length
+from cpunet.kernels import kernel
+from cpunet.networks.by_height import ByHeight
+from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, padded_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
-from cpunet.training.aligned import Frame, Samples, Values
-from cpunet.training.bands import Noise, Sides
-from cpunet.training.comparison import MOST
+from cpunet.training.aligned import Aligned, Floats, Frame, Samples, Values, read
 
 # Ratio of the limits of a band; the next is used only if no band of the previous is possible.
 WIDEST = (1.3, 2.0, 4.0, np.inf)
@@ -32,14 +40,24 @@ SLICES, IN_SLICE = 32, 50
 # The continuum begins where noise is small, and ends well before a line and its sidebands.
 CONTINUUM_FROM_KEV, CLEAR_KEV = 1000.0, 50.0
 HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
-MIN_PULSES = 200  # of a side, for a covariance
+MIN_PULSES, MOST = 200, 4096  # of a side: for a covariance, and most that are compared
 NOISES = 1000  # draws of noise that few pulses have, for the same
-# Pulses that give the slope of the tails
-DRAWN = 8192
+DRAWN = 8192  # pulses that give the slope of the tails
+# Maximum number of noise traces, each twice as long as a record.  For more pulses,
+# they share the traces, with other start samples and signs.
+NOISE_TRACES = 4096
+PLATEAU_NS = 1600.0  # after the window, over which the mean gives the height of a record
+# Times in ns from the half height between which every sample is compared, shortest and longest
+# stretches within and elsewhere, and samples compared per pulse at most.
+DENSE_NS, FINEST_NS, COARSE_NS, FEWEST = (-1000.0, 3000.0), 8.0, 64.0, 1.3
+# A measured pulse with another before it, or on its tail: height of its baseline, time from
+# which the tail counts, and its RMS in units of the median.
+QUIET, TAIL_NS, LATE_RMS = 0.05, 2400.0, 4.0
 
 SINGLE = "single sites of the continuum"
 
 Continuum = Callable[[], tuple[InputSet, InputSet]]
+Rows = slice | Samples | npt.NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +190,251 @@ def spectrum_weights(sim_kev: Values, data_kev: Values) -> Values:
     return np.asarray(weights / max(weights.mean(), 1e-9))
 
 
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Noise for a set of pulses, the same at each use.
+
+    Parameters
+    ----------
+    traces
+        For an energy of 1 keV, shape (traces, samples).
+    trace, start, factor
+        Trace, start sample, and sign divided by energy, for each draw and pulse; each of shape
+        (draws, pulses).
+    left, decay
+        Pile-up tails for each record, shape (draws, pulses), and their decay over
+        a record, shape (samples,); None for none.
+    """
+
+    traces: FloatArray
+    trace: npt.NDArray[np.intp]
+    start: npt.NDArray[np.intp]
+    factor: FloatArray
+    left: FloatArray | None = None
+    decay: FloatArray | None = None
+
+    @classmethod
+    def draw(
+        cls,
+        noise: BaselineNoise,
+        energy_kev: Values,
+        length: int,
+        pairs: int,
+        rng: np.random.Generator,
+        tails: DrawnTails | None = None,
+    ) -> Noise:
+        """Draw noise for records of `length` samples.
+
+        The two draws of a pair are of opposite sign, so that the contribution of noise to a
+        mean cancels.
+        """
+        n = len(energy_kev)
+        n_traces = min(NOISE_TRACES, n * pairs)
+        traces = noise.draw(np.ones(n_traces), 2 * length, rng)
+        # each trace is used before any is used again
+        trace = np.concatenate(
+            [rng.permutation(n_traces) for _ in range(-(-n * pairs // n_traces))]
+        )
+        trace = np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)
+        sign = rng.choice((-1.0, 1.0), (pairs, n))
+        start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
+        factor = np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev
+        left = decay = None
+        if tails is not None:
+            left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
+            decay = np.asarray(tails.decay(length), np.float32)
+        return cls(traces, trace, start, np.asarray(factor, np.float32), left, decay)
+
+    def add(self, records: FloatArray, draw: int) -> FloatArray:
+        """Records of the pulses with the noise of a draw."""
+        noisy = np.empty(records.shape, np.float32)
+        trace, start, factor = (each[draw] for each in (self.trace, self.start, self.factor))
+        _add(records, self.traces, trace, start, factor, noisy)
+        if self.left is not None and self.decay is not None:
+            noisy += self.left[draw, :, np.newaxis] * self.decay
+        return noisy
+
+
+@kernel(error_model="numpy")
+def _add(
+    records: Any, traces: Any, trace: Any, start: Any, factor: Any, noisy: Any
+) -> None:  # pragma: no cover - compiled
+    """Add part of a noise trace to each record: index of the trace, start sample, factor."""
+    for row in range(len(records)):
+        drawn, first, scale = traces[trace[row]], start[row], factor[row]
+        for i in range(records.shape[1]):
+            noisy[row, i] = records[row, i] + scale * drawn[first + i]
+
+
+class Sides:
+    """Simulated pulses with their noise, and measured ones, of a band of energies.
+
+    Parameters
+    ----------
+    sim
+        Prepared simulated pulses.
+    data
+        Prepared measured pulses, shape (pulses, samples).
+    noise
+        Noise of the simulated pulses.
+    recipe
+        Recipe that matches a response, which says what is read.
+    name, rows
+        Name of the band, and rows of the simulated pulses in the set that they are of.
+
+    Attributes
+    ----------
+    sim, current, charge
+        Simulated pulses, shape (pulses, samples), and the same within records.
+    data, data_view
+        Measured pulses that are single, and their means over the stretches.
+    left_out
+        Number of the others.
+    first, widths, time_ns
+        First sample and samples of each stretch that is compared, and its middle in ns from the
+        half height.
+    by_height
+        What the electronics do by the height of a pulse.
+    """
+
+    by_height: ByHeight | None = None
+
+    def __init__(
+        self,
+        sim: Pulses,
+        data: FloatArray,
+        noise: Noise,
+        recipe: Recipe,
+        name: str,
+        rows: Samples,
+    ) -> None:
+        self.frame = frame = Frame.of(recipe.matching.training)
+        # height of the plateau of a prepared pulse, to which the noise refers
+        self.tail_level = recipe.preparation.tail_level
+        self.noise, self.energy_kev, self.name, self.rows = noise, sim.energy_kev, name, rows
+        self.before, self.behind = padding(frame.dt_ns)
+        self.length = sim.length + self.before + self.behind
+        self.padded = padded_length(self.length)
+        self.take(sim.waveforms)
+        every = read(data, frame)
+        self.late = slice(frame.before + round(TAIL_NS / frame.dt_ns), None)
+        late = every.pulses[:, self.late]
+        self.middle = np.median(late, axis=0)
+        self.spread = np.median(np.abs(late - self.middle), axis=0)
+        self.widest = LATE_RMS * float(np.median(self.late_rms(every)))
+        single = self.single(every)
+        self.data, self.left_out = every[single], int((~single).sum())
+        self.divide()
+
+    def __len__(self) -> int:
+        return len(self.current)
+
+    def take(self, sim: FloatArray) -> None:
+        """Let these be the simulated pulses of the same events."""
+        self.sim, inside = sim, slice(self.before, self.before + sim.shape[1])
+        self.current = np.zeros((len(sim), self.length), np.float32)
+        self.current[:, inside] = np.diff(sim, axis=1, prepend=np.float32(0))
+        self.charge = self.current.cumsum(axis=1, dtype=np.float32)
+        self.spectra = scipy.fft.rfft(self.current, self.padded)
+
+    def divide(self) -> None:
+        """Divide pulses into stretches; the fewer pulses, the longer stretches."""
+        frame, most = self.frame, FEWEST * min(len(self), len(self.data))
+        length = frame.before + frame.after
+        fine, coarse = (max(1, round(ns / frame.dt_ns)) for ns in (FINEST_NS, COARSE_NS))
+        while True:
+            first, at = list[int](), 0
+            while at < length:
+                first.append(at)
+                dense = DENSE_NS[0] <= (at - frame.before) * frame.dt_ns < DENSE_NS[1]
+                at += fine if dense else max(fine, coarse)
+            if len(first) <= most or fine > coarse:
+                break
+            fine *= 2
+        self.first = np.array(first)
+        self.widths = np.diff(np.append(self.first, length))
+        middle = self.first + 0.5 * (self.widths - 1) - frame.before
+        self.time_ns: Values = np.asarray(middle * frame.dt_ns)
+        self.data_view = self.view(self.data.pulses)
+
+    def entering(self, response: ElectronicsResponse) -> Sides:
+        """The same pulses around a readout: drift stretched, and what acts by their height."""
+        if response.drift is None and response.by_height is self.by_height:
+            return self
+        other = copy.copy(self)
+        if response.drift is not None:
+            other.take(response.drifted(self.sim))
+        other.by_height = response.by_height
+        return other
+
+    def of(self, most: int) -> Sides:
+        """The first pulses of both sides."""
+        return self if most >= max(len(self), len(self.data)) else self.some(slice(most))
+
+    def some(self, rows: slice) -> Sides:
+        """Some pulses of both sides, in stretches of their own."""
+        some = self.of_events(rows)
+        some.data = self.data[rows]
+        some.divide()
+        return some
+
+    def of_events(self, rows: Rows) -> Sides:
+        """Some of the simulated pulses, and all measured ones."""
+        some = copy.copy(self)
+        for name in ("sim", "current", "charge", "spectra", "energy_kev", "rows"):
+            setattr(some, name, getattr(self, name)[rows])
+        noise, names = self.noise, ("trace", "start", "factor")
+        drawn = {name: np.ascontiguousarray(getattr(noise, name)[:, rows]) for name in names}
+        left = None if noise.left is None else noise.left[:, rows]
+        some.noise = replace(noise, left=left, **drawn)
+        return some
+
+    def late_rms(self, aligned: Aligned) -> Values:
+        """RMS of the tail of each pulse about the median, in units of the spread."""
+        deviation = (aligned.pulses[:, self.late] - self.middle) / self.spread
+        return np.asarray(np.sqrt((deviation**2).mean(axis=1)))
+
+    def single(self, aligned: Aligned) -> npt.NDArray[np.bool_]:
+        """Which pulses have no other before them or on their tail."""
+        base = aligned.pulses[:, : self.frame.before // 4].mean(axis=1)
+        quiet: npt.NDArray[np.bool_] = np.abs(base) < QUIET
+        return quiet & (self.late_rms(aligned) < self.widest)
+
+    def view(self, aligned: Floats) -> Floats:
+        """Means of aligned pulses over the stretches, shape (pulses, stretches)."""
+        sums = np.add.reduceat(aligned, self.first, axis=1)
+        return np.asarray(sums / self.widths.astype(sums.dtype))
+
+    def translated(self, transfer: Spectrum) -> tuple[FloatArray, Floats]:
+        """Noise-free records of prepared height, and the height of each before."""
+        spectra = self.spectra * transfer.astype(np.complex64)
+        records = scipy.fft.irfft(spectra, self.padded, overwrite_x=True)[:, : self.length]
+        plateau = slice(-self.behind, round(PLATEAU_NS / self.frame.dt_ns) - self.behind)
+        heights = records[:, plateau].mean(axis=1) / np.float32(self.tail_level)
+        return np.asarray(records / heights[:, np.newaxis], np.float32), heights
+
+    def changed(self, sim: FloatArray, transfer: Spectrum, heights: Floats) -> FloatArray:
+        """What a change of the simulated pulses does to the records."""
+        change = np.diff(sim, axis=1, prepend=np.float32(0))
+        spectra = scipy.fft.rfft(change, self.padded) * transfer.astype(np.complex64)
+        records = scipy.fft.irfft(spectra, self.padded, overwrite_x=True)
+        inside = np.roll(records, self.before, axis=1)[:, : self.length]
+        return np.asarray(inside / heights[:, np.newaxis], np.float32)
+
+    def noisy(self, clean: FloatArray, heights: Floats) -> list[Aligned]:
+        """Records with each draw of the noise, read."""
+        return [self.read(clean, heights, draw) for draw in range(len(self.noise.factor))]
+
+    def read(self, clean: FloatArray, heights: Floats, draw: int | None = None) -> Aligned:
+        """Records of prepared height, with a draw of noise or none, behind the electronics."""
+        records = clean if draw is None else self.noise.add(clean, draw)
+        if self.by_height is not None:
+            height = heights[:, np.newaxis].astype(np.float32)
+            charge, noise = clean * height, (records - clean) * height
+            records = np.asarray(self.by_height(charge, self.energy_kev, noise), np.float32)
+        return read(records, self.frame)
+
+
 @dataclass(eq=False)
 class PulseSets:
     """Both sides in bands of energy, and representative subsets of them.
@@ -193,8 +456,8 @@ class PulseSets:
 
     Attributes
     ----------
-    parted, names
-        Each band, with its pulses of both sides in random order; their names.
+    bands
+        Bands of energy, with their pulses of both sides in random order.
     tail_slope
         Median slope per sample of the logarithm of the data's tails.
 
@@ -214,13 +477,12 @@ class PulseSets:
 
     def __post_init__(self) -> None:
         require_energies(self.sim.energy_kev)
-        both = self.sim.energy_kev, self.data.energy_kev
-        # in random order, so that any first part is representative
-        self.parted = [
-            (band, [self.rng.permutation(len(rows)) for rows in (band.sim, band.data)])
-            for band in energy_bands(*both, self.recipe.peaks)
-        ]
-        self.names = [band.name for band, _ in self.parted]
+        self.bands = list[EnergyBand]()
+        for band in energy_bands(self.sim.energy_kev, self.data.energy_kev, self.recipe.peaks):
+            # in random order, so that any first part is representative
+            sim, data = (self.rng.permutation(len(side)) for side in (band.sim, band.data))
+            shuffled = band.sim[sim], band.data[data], band.weights[sim]
+            self.bands.append(EnergyBand(band.name, *shuffled))
         samples = self.recipe.preparation.decay_fit_samples
         lever = np.arange(samples) - 0.5 * (samples - 1)
         tails = self.data.waveforms[spread(len(self.data), DRAWN), -samples:]
@@ -229,34 +491,29 @@ class PulseSets:
 
     def sides(self) -> list[Sides]:
         """Pulses of both sides in each band, for the comparison at every sample."""
-        sides = []
-        for band, (of_sim, of_data) in self.parted:
-            data, some = self.data.waveforms[band.data[of_data[:MOST]]], of_sim[:MOST]
-            sides.append(self._sides(self.sim, band.sim[some], data, band.weights[some]))
-        return sides
+        return [self._sides(self.sim, self.data, band) for band in self.bands]
 
     def single_sites(self) -> list[Sides]:
         """Pulses of the continuum, whose single sites are compared; none if they are few."""
         if self.continuum is None:
             return []
         sim, data = (side.prepared.pulses for side in self.continuum())
-        rows, of_data = (self.rng.permutation(len(side))[:MOST] for side in (sim, data))
-        if min(len(rows), len(of_data)) < MIN_PULSES:
+        rows = [self.rng.permutation(len(side))[:MOST] for side in (sim, data)]
+        if min(map(len, rows)) < MIN_PULSES:
             return []
-        weights = spectrum_weights(sim.energy_kev[rows], data.energy_kev[of_data])
-        return [self._sides(sim, rows, data.waveforms[of_data], weights)]
+        weights = spectrum_weights(sim.energy_kev[rows[0]], data.energy_kev[rows[1]])
+        return [self._sides(sim, data, EnergyBand(SINGLE, rows[0], rows[1], weights))]
 
-    def _sides(self, sim: Pulses, rows: Samples, data: FloatArray, weights: Values) -> Sides:
-        preparation, training = self.recipe.preparation, self.recipe.matching.training
+    def _sides(self, sim: Pulses, data: Pulses, band: EnergyBand) -> Sides:
+        rows, weights = band.sim[:MOST], band.weights[:MOST]
         if np.ptp(weights) > 0:  # each as often as its weight says, to a whole number
             share = np.cumsum(weights) / weights.sum()
             rows = rows[np.searchsorted(share, (np.arange(len(rows)) + 0.5) / len(rows))]
-        sim, data = sim[rows], data[np.isfinite(data).all(axis=1)]
-        length, kev = record_length(sim.waveforms.shape[1], sim.dt_ns), sim.energy_kev
-        pairs = max(1, round(NOISES / len(sim)))
-        noise = Noise.draw(self.noise, kev, length, pairs, self.rng, self.tails)
-        frame, level = Frame.of(training), preparation.tail_level
-        return Sides(sim.waveforms, data, noise, frame, level, kev, rows)
+        sim, measured = sim[rows], data.waveforms[band.data[:MOST]]
+        length, pairs = record_length(sim.length, sim.dt_ns), max(1, round(NOISES / len(sim)))
+        noise = Noise.draw(self.noise, sim.energy_kev, length, pairs, self.rng, self.tails)
+        finite = np.isfinite(measured).all(axis=1)
+        return Sides(sim, measured[finite], noise, self.recipe, band.name, rows)
 
 
 def spread(n: int, most: int) -> Samples:

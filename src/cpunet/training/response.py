@@ -19,8 +19,13 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import FolderKind, folder_written_aside, refuse_existing
 from cpunet.settings import plain, yaml_text
 from cpunet.tables import text_table, with_std
-from cpunet.training.chain_description import DescribedChain, describe_chain
-from cpunet.training.closed_forms import chain_numbers, true_chain_of, true_parameters
+from cpunet.training.chain_description import (
+    DescribedChain,
+    chain_numbers,
+    describe_chain,
+    true_chain_of,
+    true_parameters,
+)
 from cpunet.training.run import RunLike, as_run
 
 if TYPE_CHECKING:
@@ -66,15 +71,26 @@ ROWS = {
 }
 # What a page of channels shows, and where a channel stands out: so many robust standard
 # deviations from the median, of at least so many channels.
-SHOWN = {
-    "rise_10_90_ns": "rise 10–90 % [ns]",
-    "slow_share": "late charge",
-    "missing_500_ns": "not yet collected after 500 ns",
-    "effective_decay_us": "effective decay [µs]",
-    "noise_rms_kev": "noise RMS [keV]",
-    "chi_square_per_moment": "chi-square per moment",
-}
+SHOWN = (
+    *("rise_10_90_ns", "slow_share", "missing_500_ns", "effective_decay_us", "noise_rms_kev"),
+    "chi_square_per_moment",
+)
 FAR, FEW = 4.0, 5
+
+
+def row_of(name: str) -> tuple[int, str, float]:
+    """Place of a quantity in `ROWS`, its title, and what its values are multiplied by.
+
+    Examples
+    --------
+    >>> row_of("rise_10_90_ns")[1:], row_of("slow_share")[1:]
+    (('rise 10–90 % [ns]', 1.0), ('late charge [%]', 100.0))
+    """
+    for place, (pattern, (text, unit)) in enumerate(ROWS.items()):
+        if re.fullmatch(pattern, name):
+            title = re.sub(pattern, text, name) + (f" [{unit}]" if unit else "")
+            return place, title, {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
+    raise KeyError(name)
 
 
 class Response:
@@ -108,17 +124,8 @@ class Response:
         own, errors, true = first.values, first.errors, self.true_values
         self.difference = {n: own[n] - true[n] for n in true if n in own}
         self.sigma = {n: off / errors[n] for n, off in self.difference.items() if errors.get(n)}
-        sources = [*(chain.values for chain in runs), true]
-        rows = {  # by name, in the order of `ROWS`: place, label, unit
-            name: next(
-                (place, re.sub(pattern, text, name), unit)
-                for place, (pattern, (text, unit)) in enumerate(ROWS.items())
-                if re.fullmatch(pattern, name)
-            )
-            for source in sources
-            for name in source
-        }
-        self.rows = dict(sorted(rows.items(), key=lambda row: row[1][0]))
+        names = [name for source in (*(of.values for of in runs), true) for name in source]
+        self.rows = sorted(dict.fromkeys(names), key=lambda name: row_of(name)[0])
 
     @property
     def values(self) -> DataFrame:
@@ -128,7 +135,7 @@ class Response:
         columns = {chain.run.name: chain.values for chain in self.runs}
         if self.truth is not None:
             columns["truth"] = self.true_values
-        return DataFrame(columns).reindex([*self.rows])
+        return DataFrame(columns).reindex(self.rows)
 
     def plot(self) -> Figure:
         """Step and impulse response, tail and noise."""
@@ -178,16 +185,16 @@ class Response:
             head += [self.truth.name, *(["difference", "σ"] if alone else [])]
             sources.append((self.true_values, {}))
         rows = []
-        for name, (_, label, unit) in self.rows.items():
-            scale = {"%": 100.0, "‰": 1000.0}.get(unit, 1.0)
-            cells = [f"{label} [{unit}]" if unit else label]
+        for name in self.rows:
+            _, title, scale = row_of(name)
+            cells = [title]
             for pair in sources:
                 scaled = (scale * of[name] if name in of else None for of in pair)
                 cells.append(with_std(*scaled))
             if self.truth is not None and alone:
                 difference, true = self.difference.get(name), self.true_values.get(name)
                 text = ""
-                if difference is not None and unit == "%":  # of shares in percentage points
+                if difference is not None and scale == 100:  # of shares in percentage points
                     text = f"{100 * difference:+.2f} pp"
                 elif difference is not None and true:
                     text = f"{100 * difference / true:+.1f} %"
@@ -322,12 +329,12 @@ def array_page(chains: Mapping[str, DescribedChain]) -> str:
     from cpunet.html_pages import rendered
 
     columns: dict[str, list[tuple[str, bool]]] = {}
-    for name, title in SHOWN.items():
-        values = [chain.values.get(name) for chain in chains.values()]
-        errors = [chain.errors.get(name) for chain in chains.values()]
-        if any(value is not None for value in values):
-            texts = [with_std(v, e) for v, e in zip(values, errors, strict=True)]
-            columns[title] = list(zip(texts, outliers(values, errors), strict=True))
+    for name in SHOWN:
+        _, title, scale = row_of(name)
+        both = [(chain.values.get(name), chain.errors.get(name)) for chain in chains.values()]
+        if any(value is not None for value, _ in both):
+            texts = [with_std(*(of and scale * of for of in pair)) for pair in both]
+            columns[title] = list(zip(texts, outliers(*zip(*both, strict=True)), strict=True))
     rows = list[dict[str, Any]]()
     for i, (channel, chain) in enumerate(chains.items()):
         cells = [column[i] for column in columns.values()]

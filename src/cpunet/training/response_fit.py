@@ -15,26 +15,39 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.bands import Sides
-from cpunet.training.chain_description import DRIFT, stretched
-from cpunet.training.chain_fit import Fitted, Fitter, chi_square, fit_chain
-from cpunet.training.chain_parameters import by_name, with_decay, with_settings
-from cpunet.training.comparison import AMPLITUDE, Comparison, Difference
+from cpunet.training.chain_fit import (
+    Fitted,
+    Fitter,
+    by_name,
+    chi_square,
+    fit_chain,
+    with_decay,
+    with_settings,
+)
 from cpunet.training.deviations import with_deviations
 from cpunet.training.heights import with_heights
-from cpunet.training.pulse_sets import SINGLE, PulseSets
-from cpunet.training.verdict import WIDTH, FitInfo, Verdict, verdict
+from cpunet.training.pulse_sets import SINGLE, PulseSets, Sides
+from cpunet.training.verdict import DRIFT, FitInfo, Verdict, stretched, verdict
 
 # What stretches the drift must lower chi-square of held-out pulses by this much.  Drift that is
 # longer or shorter by more than a third is that of another detector.
 NEEDED, MAX_STRETCH = 16.0, 1 / 3
 BY_HEIGHT = "slew rate and curve"
+
+
+class _Learned(NamedTuple):
+    """A chain, the response with its deviations, if any, and what every sample says of it."""
+
+    chain: Fitted
+    response: ElectronicsResponse
+    checks: Verdict
+    info: FitInfo
 
 
 def fit_response(
@@ -58,48 +71,56 @@ def fit_response(
         If the pulses are too few, or the fit does not find a finite chi-square.
     """
     bands, chains = sets.sides(), list[Fitted]()
-    for start in _starts(sets, fitter, start_from):
-        chains.append(fit_chain(start, bands, fitter))
+    config, training = sets.recipe.matching
+    starts = [] if start_from is None else [copy.deepcopy(start_from)]
+    for factor in training.start_factors:
+        starts.append(ElectronicsResponse(config, sets.noise.dt_ns))
+        starts[-1].log_poles_ns += math.log(factor)
+    for start in starts:
+        chains.append(fit_chain(with_decay(start, sets.tail_slope), bands, fitter))
         if not chains[-1].poor:
             break  # no other valley to search for
     nearest = min(chains, key=lambda chain: chain.chi_square)
     best = _learned(nearest, bands, fitter)
     # of few pulses, the onset is not off for sure, but nothing else is either
     if not best.checks.good and (not best.checks.off or "onset" in best.checks.off):
-        stretched = _stretched(best.chain, bands, fitter)
-        if stretched is not None:
-            other = _learned(stretched, bands, fitter)
-            other = _with_single_sites(other, sets, bands, fitter)
+        longer = _stretched(best.chain, bands, fitter)
+        if longer is not None:
+            other = _with_single_sites(_learned(longer, bands, fitter), sets, bands, fitter)
             best = min(best, other, key=lambda learned: learned.checks.chi_square)
-    return best.response, described(best, sets, bands, fitter)
 
-
-def _starts(
-    sets: PulseSets, fitter: Fitter, start_from: ElectronicsResponse | None
-) -> Iterator[ElectronicsResponse]:
-    """Where fits start: the response given, then chains of the recipe with the data's decay."""
-    if start_from is not None:
-        yield with_decay(copy.deepcopy(start_from), sets.tail_slope)
-    config, training = sets.recipe.matching
-    for factor in training.start_factors:
-        start = ElectronicsResponse(config, sets.noise.dt_ns)
-        start.log_poles_ns += math.log(factor)
-        yield with_decay(start, sets.tail_slope)
-
-
-class _Learned(NamedTuple):
-    """A chain, the response with its deviations, if any, and what every sample says of it."""
-
-    chain: Fitted
-    response: ElectronicsResponse
-    checks: Verdict
+    response, info, covariance = best.response, best.info, best.chain.covariance
+    total, functions = chi_square(response, bands)
+    fitter.count(total)
+    shift, error = info.amplitude_shift or 0.0, info.amplitude_shift_error or 0.0
+    values, parts, amplitude = response.describe(), [str(best.checks)], "the current amplitude"
+    if abs(shift) >= 2 * error:
+        parts.append(f"{amplitude} is off by {100 * shift:+.2f} ± {100 * error:.2f} %")
+    elif best.checks.good:  # else, that the shift is small does not make the shape right
+        parts.append(f"{amplitude} has a statistical error of {100 * error:.2g} % (1σ)")
+    facts = {
+        "verdict": "; ".join(parts + stretched(values, fitter.gains)),
+        "chi_square": total,
+        "moments": round(functions),
+        "steps": fitter.steps,
+        "parameters": values,
+        "errors": by_name(best.chain.response, np.sqrt(covariance.diagonal())),
+        "covariance": covariance.tolist(),
+        "delay_ns": response.delay_ns(),
+        "gains": fitter.gains,
+        "in_no_band": {
+            "sim": len(sets.sim) - sum(len(band.sim) for band in sets.bands),
+            "data": len(sets.data) - sum(len(band.data) for band in sets.bands),
+        },
+    }
+    return response, info.model_copy(update=facts)
 
 
 def _learned(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned:
     """Learn what a chain does not do, by the height of a pulse if heights differ."""
     response = chain.response
     around = [sides.entering(response) for sides in bands]
-    alone = _Learned(chain, response, verdict(response, around))
+    alone = _Learned(chain, response, *verdict(response, around))
     # behind a stretched drift, deviations would make up for what is left of other physics
     linear = response.drift is None and response.by_height is None
     if not chain.poor and (alone.checks.clear if linear else alone.checks.good):
@@ -110,24 +131,31 @@ def _learned(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned:
         tried += [] if shaped is None else [_learned(shaped, bands, fitter)]
         if tried and tried[0].checks.good:
             return tried[0]
-    deviated = with_deviations(response, around, fitter.count).response
+    deviated, _ = with_deviations(response, around, fitter.count)
     around = [sides.entering(deviated) for sides in bands]
-    tried.append(_Learned(chain, deviated, verdict(deviated, around)))
+    tried.append(_Learned(chain, deviated, *verdict(deviated, around)))
     return min(tried, key=lambda learned: learned.checks.chi_square)
 
 
 def _stretched(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> Fitted | None:
-    """Stretch the drift, by a factor that may change with time, as far as that gains."""
-    best = None
+    """Stretch the drift, by a factor that may change with time, as far as that gains.
+
+    Chi-squares are those of either half of the pulses when fitted to the other.
+    """
+    best, halves = None, [[sides.some(slice(k, None, 2)) for sides in bands] for k in range(2)]
     for terms in range(1, fitter.training.drift_terms + 1):
-        before = (best or chain).response
+        before, held_out = (best or chain).response, list[float]()
         start = with_settings(before, drift_terms=terms)
         tried = fit_chain(start, bands, fitter, search=terms == 1)
         assert tried.response.drift is not None
-        gain = held_out(before, tried.response, bands, fitter)
+        for response in (before, tried.response):
+            held_out.append(0.0)
+            for fitted, held in (halves, halves[::-1]):
+                again = fit_chain(copy.deepcopy(response), fitted, fitter, search=False)
+                held_out[-1] += chi_square(again.response, held)[0]
         sane = np.abs(tried.response.drift.stretch).max() < MAX_STRETCH
-        gains = bool(gain[0] - gain[1] > NEEDED and sane)
-        text = f"chi-square of held-out pulses {gain[0]:.0f} → {gain[1]:.0f}"
+        gains = bool(held_out[0] - held_out[1] > NEEDED and sane)
+        text = f"chi-square of held-out pulses {held_out[0]:.0f} → {held_out[1]:.0f}"
         fitter.gains[DRIFT[terms]] = f"{'gains' if gains else 'left out'}; {text}"
         if not gains:
             break
@@ -151,81 +179,3 @@ def _with_single_sites(
     used = tried.checks.good >= learned.checks.good
     fitter.gains[SINGLE] = f"{'used' if used else 'left out'}; {tried.checks}"
     return tried if used else learned
-
-
-def held_out(
-    first: ElectronicsResponse,
-    second: ElectronicsResponse,
-    bands: Sequence[Sides],
-    fitter: Fitter,
-) -> list[float]:
-    """Chi-square of two responses on either half of the pulses when fitted to the other."""
-    halves = [[sides.some(slice(k, None, 2)) for sides in bands] for k in range(2)]
-    totals = []
-    for response in (first, second):
-        total = 0.0
-        for fitted, held in (halves, halves[::-1]):
-            again = fit_chain(copy.deepcopy(response), fitted, fitter, search=False)
-            total += chi_square(again.response, held)[0]
-        totals.append(total)
-    return totals
-
-
-def described(
-    best: _Learned, sets: PulseSets, bands: Sequence[Sides], fitter: Fitter
-) -> FitInfo:
-    """Describe the fit of a response."""
-    response, pulls, quantiles = best.response, dict[str, float](), list[Difference]()
-    compared: dict[str, list[int]] = {}
-    covariance = best.chain.covariance
-    for name, sides in zip(sets.names, bands, strict=True):
-        transfer = response.transfer(sides.padded)
-        here = Comparison(sides.entering(response), transfer, WIDTH)
-        band = f"{name}: " if len(bands) > 1 else ""
-        z = zip(sides.time_ns, here.mean_pulse().tolist(), strict=True)
-        pulls |= {f"{band}{t:.0f} ns": value for t, value in z}
-        of_amplitude = f"{AMPLITUDE} quantiles"
-        quantiles += [d for d in here.differences() if d.name == of_amplitude]
-        compared[name] = [len(sides), len(sides.data)]
-    total, functions = chi_square(response, bands)
-    fitter.count(total)
-    shift, error = amplitude_shift(quantiles)
-    values, parts, amplitude = response.describe(), [str(best.checks)], "the current amplitude"
-    if abs(shift) >= 2 * error:
-        parts.append(f"{amplitude} is off by {100 * shift:+.2f} ± {100 * error:.2f} %")
-    elif best.checks.good:  # else, that the shift is small does not make the shape right
-        parts.append(f"{amplitude} has a statistical error of {100 * error:.2g} % (1σ)")
-    return FitInfo(
-        checks=best.checks,
-        verdict="; ".join(parts + stretched(values, fitter.gains)),
-        chi_square=total,
-        moments=round(functions),
-        steps=fitter.steps,
-        parameters=values,
-        errors=by_name(best.chain.response, np.sqrt(covariance.diagonal())),
-        covariance=covariance.tolist(),
-        delay_ns=response.delay_ns(),
-        pulls=pulls,
-        gains=fitter.gains,
-        bands=compared,
-        in_no_band={
-            "sim": len(sets.sim) - sum(len(band.sim) for band, _ in sets.parted),
-            "data": len(sets.data) - sum(len(band.data) for band, _ in sets.parted),
-        },
-        data_left_out=sum(sides.left_out for sides in bands),
-        amplitude_shift=shift,
-        amplitude_shift_error=error,
-    )
-
-
-def amplitude_shift(quantiles: Sequence[Difference]) -> tuple[float, float]:
-    """Relative shift that the translated current amplitudes need, and its error.
-
-    It brings the quantiles of their logarithm closest to the data's.
-    """
-    weight = weighted = 0.0
-    for difference in quantiles:
-        inverse = np.linalg.inv(difference.covariance)
-        weight += float(inverse.sum())
-        weighted -= float(inverse.sum(axis=0) @ difference.values)
-    return weighted / weight, weight**-0.5

@@ -207,11 +207,7 @@ class Run(InfoPart):
         where, prefix = (self.folder or Path()) / WEIGHTS, f"{part}."
         weights = self.weights.items()
         own = {key.removeprefix(prefix): of for key, of in weights if key.startswith(prefix)}
-        if wrong := differing(own, arrays_of(network)):
-            raise CpunetError(
-                f"{where}: weights of another network: {len(wrong)} tensors differ, first "
-                f"{wrong[0]}"
-            )
+        require_alike(own, arrays_of(network), where)
         floating = {key: values for key, values in own.items() if values.dtype.kind == "f"}
         for key, values in floating.items():
             if not np.isfinite(values).all():
@@ -243,9 +239,7 @@ class Run(InfoPart):
         if tails is None or tails.drawn is None:
             return None
         drawn = TypeAdapter(DrawnTails).validate_python(tails.drawn)
-        if tails.rate_khz > 0:
-            return drawn
-        return replace(drawn, rate_khz=0.0)
+        return drawn if tails.rate_khz > 0 else replace(drawn, rate_khz=0.0)
 
     @cached_property
     def records(self) -> list[Record]:
@@ -392,10 +386,12 @@ def arrays_of(part: Stored | nn.Module) -> dict[str, Array]:
     return {name: values.detach().cpu().numpy() for name, values in part.state_dict().items()}
 
 
-def differing(own: Mapping[str, Any], expected: Mapping[str, Any]) -> list[str]:
-    """Names of arrays, of either library, that only a single side has, or in another shape."""
+def require_alike(own: Mapping[str, Any], expected: Mapping[str, Any], path: Path) -> None:
+    """Raise a `CpunetError` unless a file has the expected arrays, of either library."""
     shapes = [{name: value.shape for name, value in side.items()} for side in (own, expected)]
-    return sorted({name for name, _ in shapes[0].items() ^ shapes[1].items()})
+    if wrong := sorted({name for name, _ in shapes[0].items() ^ shapes[1].items()}):
+        text = f"{len(wrong)} tensors differ, first {wrong[0]}"
+        raise CpunetError(f"{path}: weights of another network: {text}")
 
 
 def resolve_device(device: str, recipe: Recipe) -> str:

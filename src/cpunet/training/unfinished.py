@@ -41,9 +41,7 @@ log = logging.getLogger(__name__)
 
 CHECKPOINT, ASIDE = "checkpoint.pt", ".checkpoint.partial"
 UNFINISHED = FolderKind(
-    name="unfinished run",
-    command="cpunet train",
-    own=r"checkpoint\.pt|\.checkpoint\.partial",
+    name="unfinished run", command="cpunet train", own=r"checkpoint\.pt|\.checkpoint\.partial"
 )
 State = dict[str, Any]  # of a training: tensors, numbers and text, with its "iteration"
 
@@ -196,9 +194,8 @@ def waiting_signals() -> Iterator[list[int]]:
         log.info("stopping after this iteration; once more to stop at once")
 
     if threading.current_thread() is threading.main_thread():  # others get no signals
-        before |= {
-            number: signal.signal(number, take) for number in (signal.SIGINT, signal.SIGTERM)
-        }
+        for number in (signal.SIGINT, signal.SIGTERM):
+            before[number] = signal.signal(number, take)
     try:
         yield waiting
     finally:

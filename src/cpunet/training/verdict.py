@@ -8,16 +8,17 @@ in the pulse, and what may be the cause.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from cpunet.electronics.pile_up_tails import TailsInfo
 from cpunet.networks.response_layer import ElectronicsResponse
 from cpunet.pulses.loading import InfoPart
-from cpunet.pulses.two_sample import MIN_PULSES, classifier_auc
-from cpunet.training.bands import Sides
-from cpunet.training.comparison import AMPLITUDE, Comparison
+from cpunet.pulses.two_sample import MIN_PULSES, TwoSample, classifier_auc
+from cpunet.training.aligned import Values
+from cpunet.training.comparison import Comparison, Difference
+from cpunet.training.pulse_sets import Sides
 
 # Limits: chi-square per sample of the median slice, and per quantile of the amplitude; standard
 # errors of the mean pulse; AUC, which must also be so many deviations from its null.
@@ -25,6 +26,10 @@ MAX_CHI_SQUARE, MAX_AMPLITUDE, MAX_Z, MAX_AUC, SURE = 1.3, 2.5, 5.0, 0.6, 3.0
 CLEAR = 1 / 3  # of the way from what is expected to the limit of chi-square
 WIDTH = 3.0  # of the bounded functions in robust standard deviations
 LARGEST = 100.0  # standard errors that are stated
+# Limits of the fraction of charge that arrives late; an overshoot makes it a few percent
+# negative.
+MAX_NEGATIVE, MAX_SLOW = -0.25, 0.5
+DRIFT = {1: "drift-time scale", 2: "its change with time"}  # by number of terms
 # Parts of a pulse by their end in ns from the half height, and likely causes.
 PARTS = {
     "onset": (
@@ -89,15 +94,11 @@ class Verdict(InfoPart):
     left_out: int = 0
 
     @property
-    def distinguished(self) -> bool:
-        """Whether the classifier distinguishes the two sides."""
-        return self.auc > max(MAX_AUC, self.auc_null + SURE * self.auc_error)
-
-    @property
     def good(self) -> bool:
         """Whether nothing is off."""
         limits = self.chi_square <= MAX_CHI_SQUARE and self.amplitude <= MAX_AMPLITUDE
-        return limits and abs(self.z) <= MAX_Z and not self.distinguished
+        alike = self.auc <= max(MAX_AUC, self.auc_null + SURE * self.auc_error)
+        return limits and abs(self.z) <= MAX_Z and alike
 
     @property
     def clear(self) -> bool:
@@ -205,24 +206,24 @@ def _size(z: float) -> str:
     return few if z < LARGEST else f"more than {LARGEST:.0f} standard errors"
 
 
-def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> Verdict:
+def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> tuple[Verdict, FitInfo]:
     """Compare translated and measured pulses of all bands; the worst of each counts."""
-    chi_squares, amplitudes, means, scores = list[float](), list[float](), [], []
-    off: dict[str, float] = {}
+    chi_squares, quantiles, scores = list[float](), list[Difference](), list[TwoSample]()
+    means, off, pulls = list[tuple[Values, Values]](), dict[str, float](), dict[str, float]()
     for sides in bands:
         here = Comparison(sides, response.transfer(sides.padded), WIDTH)
         z, time = here.mean_pulse(), sides.time_ns
         means.append((z, time))
-        since = -np.inf
+        band, since = f"{sides.name}: " if len(bands) > 1 else "", -np.inf
+        pulls |= {f"{band}{t:.0f} ns": of for t, of in zip(time, z.tolist(), strict=True)}
         for part, (until, _) in PARTS.items():
             inside = (time >= since) & (time < until)
             largest, since = float(np.abs(z[inside]).max(initial=0.0)), until
             if largest > MAX_Z:
                 off[part] = max(round(largest, 1), off.get(part, 0.0))
-        differences = here.differences()
-        sliced = [d.chi_square for d in differences if d.sliced]
-        chi_squares.append(float(np.median(sliced)))
-        amplitudes += [d.chi_square for d in differences if d.name == f"{AMPLITUDE} quantiles"]
+        of_amplitude, *others = here.differences()
+        quantiles.append(of_amplitude)
+        chi_squares.append(float(np.median([d.chi_square for d in others if d.sliced])))
         translated = here.noisy[0]
         both = sides.data, translated[sides.single(translated)]
         if min(map(len, both)) >= MIN_PULSES:
@@ -230,20 +231,100 @@ def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> Verdict:
             pulses = (of.pulses for of in both)
             scores.append(classifier_auc(*pulses, seed=0, features=(more[0], more[1])))
     z, time = max(means, key=lambda mean: np.abs(mean[0]).max())
-    worst, beyond = int(np.abs(z).argmax()), time[np.abs(z) > MAX_Z].tolist()
-    auc = {}
+    worst, beyond, auc = int(np.abs(z).argmax()), time[np.abs(z) > MAX_Z].tolist(), {}
     if scores:
         distinct = max(scores, key=lambda score: score.auc - score.null_mean)
         auc = {"auc": distinct.auc, "auc_null": distinct.null_mean}
         auc["auc_error"] = distinct.null_std
-    return Verdict(
+    counts = {sides.name: [len(sides), len(sides.data)] for sides in bands}
+    left_out = sum(sides.left_out for sides in bands)
+    checks = Verdict(
         chi_square=max(chi_squares),
-        amplitude=max(amplitudes),
+        amplitude=max(difference.chi_square for difference in quantiles),
         z=float(z[worst]),
         z_ns=float(time[worst]),
         beyond_ns=[beyond[0], beyond[-1]] if beyond else [],
         off=off,
-        pulses=[sum(map(len, bands)), sum(len(sides.data) for sides in bands)],
-        left_out=sum(sides.left_out for sides in bands),
+        pulses=np.sum([*counts.values()], axis=0).tolist(),
+        left_out=left_out,
         **auc,
     )
+    shift, error = amplitude_shift(quantiles)
+    return checks, FitInfo(
+        checks=checks,
+        pulls=pulls,
+        bands=counts,
+        data_left_out=left_out,
+        amplitude_shift=shift,
+        amplitude_shift_error=error,
+    )
+
+
+def amplitude_shift(quantiles: Sequence[Difference]) -> tuple[float, float]:
+    """Relative shift that the translated current amplitudes need, and its error.
+
+    It brings the quantiles of their logarithm closest to the data's.
+    """
+    weight = weighted = 0.0
+    for difference in quantiles:
+        inverse = np.linalg.inv(difference.covariance)
+        weight += float(inverse.sum())
+        weighted -= float(inverse.sum(axis=0) @ difference.values)
+    return weighted / weight, weight**-0.5
+
+
+def beyond(parameters: Mapping[str, float]) -> list[str]:
+    """Properties of a fitted chain that no readout has, in words.
+
+    Parameters
+    ----------
+    parameters
+        Parameters from `ElectronicsResponse.describe`.
+
+    Examples
+    --------
+    >>> beyond({"pole_1_ns": 40.0, "slow_100_ns": -0.5, "slow_400_ns": -0.2})
+    ['70 % of the charge would arrive too early, which electronics cannot cause; see the fit']
+    """
+    if "deviation" in parameters:  # the parts of its chain are not what it consists of
+        return []
+    slow = sum(value for name, value in parameters.items() if name.startswith("slow_"))
+    if MAX_NEGATIVE <= slow <= MAX_SLOW:
+        return []
+    how = "late, as of slower pulses than simulated"
+    if slow < 0:
+        how = "too early, which electronics cannot cause"
+    return [f"{100 * abs(slow):.0f} % of the charge would arrive {how}; see the fit"]
+
+
+def stretched(parameters: Mapping[str, float], gains: Mapping[str, str] = {}) -> list[str]:
+    """Say in words that the simulated drift was stretched, if it was, and what that may mean.
+
+    Parameters
+    ----------
+    parameters
+        Parameters from `ElectronicsResponse.describe`.
+    gains
+        What held-out pulses say of each part that was tried.
+
+    Examples
+    --------
+    >>> print(stretched({"drift_stretch": 0.052})[0])
+    charges drift for 5.2 % longer than simulated, as in a warmer detector, at a lower bias or \
+with other impurities: cpunet calibrate tells which
+    """
+    if (stretch := parameters.get("drift_stretch")) is None:
+        return []
+    change = parameters.get("drift_stretch_per_us", 0.0)
+    late, early = (
+        f"{100 * abs(of):.1f} % {'longer' if of > 0 else 'shorter'}"
+        for of in (stretch, stretch + change)
+    )
+    size = f"charges drift for {early} than simulated"
+    if change:
+        size += f" in the last microsecond, {late} near its end"
+    if (gain := gains.get(DRIFT[1], "").partition("; ")[2]) != "":
+        size += f" ({gain})"
+    how = ("warmer", "a lower") if stretch > 0 else ("colder", "a higher")
+    cause = "{} detector, at {} bias".format(*how)
+    return [f"{size}, as in a {cause} or with other impurities: cpunet calibrate tells which"]

@@ -45,7 +45,7 @@ from cpunet.pulses.parameters import (
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
 from cpunet.pulses.two_sample import LARGEST, TwoSample, classifier_auc
-from cpunet.training.closed_forms import error_ends
+from cpunet.training.chain_description import error_ends
 from cpunet.training.run import Run
 from cpunet.translation.backends import ResponseBackend
 from cpunet.translation.translator import REN
