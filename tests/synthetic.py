@@ -27,8 +27,8 @@ from matplotlib.figure import Figure
 from cpunet import recipes
 from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise, record_samples
+from cpunet.electronics.drawn_pile_up import TailsLaw, energies_at
 from cpunet.electronics.finishing import finish, padding
-from cpunet.electronics.tails_law import TailsLaw, energies_at
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.stored import Stored

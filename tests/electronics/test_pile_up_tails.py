@@ -9,15 +9,16 @@ import pytest
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.drawn_pile_up import SIZES_KEV, DrawnTails, TraceNoise, passing
-from cpunet.electronics.pile_up_tails import PileUpTails
-from cpunet.electronics.readout import RawTraces, read_out
-from cpunet.electronics.tails_law import (
+from cpunet.electronics.drawn_pile_up import (
+    SIZES_KEV,
+    DrawnTails,
     TailsLaw,
-    characteristic_exponents,
+    TraceNoise,
     energies_at,
-    fit_rate,
 )
+from cpunet.electronics.measured import passing
+from cpunet.electronics.pile_up_tails import PileUpTails, characteristic_exponents, fit_rate
+from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
@@ -121,7 +122,7 @@ def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
     raw = as_pulses(busy)
     lost = 8000 + raw.waveforms - raw.waveforms[:, :400].mean(axis=1, keepdims=True)
     blocks = [raw.with_waveforms(lost.astype(np.float32))]
-    found = PileUpTails.of(Baselines.of(blocks, PREPARATION), decay_us=54.6)
+    found = PileUpTails.of(Baselines.of(blocks, PREPARATION))
     assert not found.level_weight
     assert found.describe().told_by == "slope"
     large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.tails_kev > 100)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from cpunet.electronics.exponentials import FloatArray
+from cpunet.electronics.chain import FloatArray
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
