@@ -70,7 +70,7 @@ LANES: list[dict[str, list[str]]] = [
             " --set training.noise=baselines"
             " --set generator.width=4 --set training.iterations=20"
             " --set training.decay_start=10 --set training.log_interval=1"
-            " --set training.statistics_batches=2",
+            " --set training.statistics_batches=2"
         ],
     },
     {
@@ -80,7 +80,7 @@ LANES: list[dict[str, list[str]]] = [
         ],
         "calibrate": [
             f"calibrate {STAND.format('shifted-stand')} --events 800"
-            " --free temperature,impurity --out calibrated",
+            " --free temperature,impurity --out calibrated"
         ],
     },
     {"closure": train_and_validate("{DATA}/closure", "closure")},

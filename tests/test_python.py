@@ -28,11 +28,7 @@ from cpunet.tables import with_std
 from cpunet.translation.translator import NOISE_ROWS, RejectionWarning
 from synthetic import FACTS, KEV, write_run, write_sides
 
-SHORT = {
-    "training.steps": 20,
-    "training.start_factors": [1],
-    "scores.bootstraps": 20,
-}
+SHORT = {"training.steps": 20, "training.start_factors": [1], "scores.bootstraps": 20}
 N = 260
 
 
@@ -106,6 +102,14 @@ def test_a_run(home, run):
     assert "data:image/png;base64," in html
     assert run.fit.verdict in html
     assert run.plot().axes
+    covariance = run.covariance
+    assert list(covariance) == list(covariance.index) == list(run.fit.errors)
+    errors = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(errors, list(run.fit.errors.values()))
+    values = cpunet.compare(run, run).values
+    assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
+    with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
+        cpunet.compare(run, run.folder)
 
 
 def test_printed_numbers_agree(run, tmp_path):
@@ -164,7 +168,7 @@ def test_a_seed_gives_the_same_pulses_in_memory_in_a_file_and_of_arrays(home, ru
     assert np.array_equal(kept.waveforms, of_ren, equal_nan=True)
 
 
-def test_histogram_of_translated_pulses(home, run):
+def test_histograms_and_figures_of_translated_pulses(home, run):
     made = run.translate(home / "sim.lh5", noise=False)
     histogram = made.hist("drift_time")
     assert histogram.axes[0].name == "drift_time"
@@ -175,11 +179,7 @@ def test_histogram_of_translated_pulses(home, run):
         made.hist("drift")
     with pytest.raises(cpunet.CpunetError, match="raw traces in ADC have no parameters"):
         run.translate(home / "sim.lh5", adc=True).hist()
-
-
-def test_figures_are_drawn_where_one_says_or_for_pyplot(home, run):
-    made = run.translate(home / "sim.lh5", noise=False)
-    axes = made.plot()
+    axes = made.plot()  # for pyplot, unless one says where
     assert axes.figure is pyplot.gcf()
     assert made.hist("drift_time", bins=50).plot(ax=axes) is axes
     assert len(made.hist("drift_time", bins=50).values()) == 50
@@ -189,20 +189,6 @@ def test_figures_are_drawn_where_one_says_or_for_pyplot(home, run):
     pyplot.close("all")
     with pytest.raises(cpunet.CpunetError, match="`bins` is 0"):
         made.hist(bins=0)
-
-
-def test_covariances_have_names(run):
-    covariance = run.covariance
-    assert list(covariance) == list(covariance.index) == list(run.fit.errors)
-    errors = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(errors, list(run.fit.errors.values()))
-
-
-def test_runs_are_compared_by_their_readouts(run):
-    values = cpunet.compare(run, run).values
-    assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
-    with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
-        cpunet.compare(run, run.folder)
 
 
 def damaged(home, run) -> Path:

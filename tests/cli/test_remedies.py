@@ -180,8 +180,8 @@ def home(stand, tmp_path_factory):
         "x_mm": x,
         "y_mm": 0 * x,
         "z_mm": x,
-        "offsets": np.arange(4),
         "edep_keV": 0 * x + 900,
+        "offsets": np.arange(4),
     }
     np.savez(folder / "hits.npz", **hits)
     np.savez(folder / "far.npz", **(hits | {"z_mm": x + 500}))

@@ -159,8 +159,7 @@ def test_bad_input_is_named(sim) -> None:
 def test_rc_with_late_charge_recovers_its_parts(sim, other_fine) -> None:
     time = np.arange(0, 6000, FINE_NS)
     kernel = np.convolve(
-        np.exp(-time / 60) / 60,
-        0.93 * (time == 0) / FINE_NS + 0.07 * np.exp(-time / 500) / 500,
+        np.exp(-time / 60) / 60, 0.93 * (time == 0) / FINE_NS + 0.07 * np.exp(-time / 500) / 500
     )[: len(time)]
     data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
     found = BASELINE_METHODS["rc_late"](sim, data, DT_NS, ALIGN)
