@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -191,53 +192,23 @@ def test_histograms_and_figures_of_translated_pulses(home, run):
         made.hist(bins=0)
 
 
-def damaged(home, run) -> Path:
-    """A run whose calibration is something else."""
-    folder = shutil.copytree(run.folder, home / "damaged")
-    (folder / "calibration.json").write_text("[1]")
-    return folder
-
-
-WRONG = {
-    "an array": (
-        lambda home, _: cpunet.train(np.zeros((2, 9)), home / "raw.lh5", home / "new"),
-        "ndarray: are no pulses; give a path, a cpunet.PulseFile",
-    ),
-    "no pulse": (
-        lambda _, run: run.translate(Pulses.of(np.zeros((0, 900)), dt_ns=16)),
-        "memory holds no pulses",
-    ),
-    "none good": (
-        lambda _, run: run.translate(Pulses.of(np.zeros((3, 900)), dt_ns=16)),
-        r"none of 3 pulses can be translated \(3 ",
-    ),
-    "no report": (
-        lambda home, _: cpunet.Report.load(home / "run"),
-        "give the folder of a report",
-    ),
-    "no calibration": (
-        lambda home, _: cpunet.Calibration.load(home / "run"),
-        "no calibrated run",
-    ),
-    "damaged calibration": (
-        lambda home, run: cpunet.Calibration.load(damaged(home, run)),
-        r"calibration.json: damaged \(no mapping\); calibrate again",
-    ),
-    "strange setting": (
-        lambda home, _: cpunet.train(
-            home / "sim.lh5", home / "raw.lh5", home / "new", settings={"training.steps": {1}}
-        ),
-        r"training.steps: .*\(\{1\}\)",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_one_line(home, run, case):
-    call, words = WRONG[case]
-    with pytest.raises(cpunet.CpunetError, match=words):
-        call(home, run)
-    assert not (home / "new").exists()
+def test_what_is_wrong_is_one_line(home, run):
+    new, nothing, strange = home / "new", np.zeros((3, 900)), {"training.steps": {1}}
+    damaged, sides = home / "damaged", (home / "sim.lh5", home / "raw.lh5")
+    shutil.copytree(run.folder, damaged)
+    (damaged / "calibration.json").write_text("[1]")
+    for words, call, *given in (
+        ("ndarray: are no pulses; give a path", cpunet.train, nothing, sides[1], new),
+        ("memory holds no pulses", run.translate, Pulses.of(nothing[:0], dt_ns=16)),
+        (r"none of 3 pulses can .* \(3 ", run.translate, Pulses.of(nothing, dt_ns=16)),
+        ("give the folder of a report", cpunet.Report.load, run.folder),
+        ("no calibrated run", cpunet.Calibration.load, run.folder),
+        (r"calibration.json: damaged \(no mapping\)", cpunet.Calibration.load, damaged),
+        (r"steps: .*\(\{1\}\)", partial(cpunet.train, settings=strange), *sides, new),
+    ):
+        with pytest.raises(cpunet.CpunetError, match=words):
+            call(*given)
+    assert not new.exists()
 
 
 def test_a_recipe_and_settings_are_not_both_given():
