@@ -183,7 +183,7 @@ def make_stand(
             raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
     if physics.step_ns > _COARSEST_NS:
         raise CpunetError(
-            f"settings: step_ns = {physics.step_ns:g}: lower it to {_COARSEST_NS:g} or less"
+            f"settings: step_ns: a stand needs steps of at most {_COARSEST_NS:g} ns; lower it"
         )
     # The chain follows pulses of the longest period that is a part of that of the digitiser, of
     # whole steps, at most 4 ns, and at most half of `dt_ns` unless a step is as long.
