@@ -15,18 +15,16 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 import scipy.optimize
 import scipy.signal
 
+from cpunet.electronics.chain import ComplexArray as Spectrum
+from cpunet.electronics.chain import FloatArray as Values
 from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.parameters import current_amplitude, tail_slope
-
-Values = npt.NDArray[np.float64]
-Spectrum = npt.NDArray[np.complex128]
 
 MIN_PULSES = 50  # of either dataset, for a fit
 TAIL_SHARE = 0.75  # of the time after the alignment: 4.8 of 6.4 us, as in the paper
@@ -197,8 +195,7 @@ def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
         tau_ns = dt_ns  # the data rise faster than the simulation: any integration is worse
     elif excess(longest) > 0:
         raise CpunetError(
-            f"the measured pulses rise slower than an RC of {LONGEST_NS:g} ns makes "
-            "them; check the sampling period and the pulses of both sides"
+            f"measured pulses rise slower than behind {LONGEST_NS:g} ns; check both periods"
         )
     else:
         tau_ns = dt_ns * float(scipy.optimize.brentq(excess, 1.0, longest, xtol=TOLERANCE))

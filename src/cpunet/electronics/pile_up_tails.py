@@ -106,16 +106,12 @@ def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
         )
     if length < MIN_SAMPLES:
         raise CpunetError(
-            f"the traces have {length} samples before the pulse; pile-up tails "
-            f"need {MIN_SAMPLES} or more, so give traces with a longer baseline"
+            f"{length} samples before the pulses are too few for tails; give {MIN_SAMPLES} or more"
         )
     large = prepared.scale >= np.median(prepared.scale)
     slope = float(np.median(prepared.tail_slope[large]))
     if not slope < 0:
-        raise CpunetError(
-            "the tails of the traces do not decay, so earlier pulses leave no trace; "
-            "are these measured traces?"
-        )
+        raise CpunetError("the tails of the traces do not decay; are these measured traces?")
     values = baselines.first.waveforms[:, :length].astype(float)
     return values, float(np.median(gains)), -1e3 / slope
 

@@ -263,10 +263,8 @@ class Side:
                 calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                 yield calibrated, labels, events.hits[detected]
         if not gain:
-            raise CpunetError(
-                f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
-                "give more `events`"
-            )
+            name = self.detector.name
+            raise CpunetError(f"no event gives a signal in {name}; give more `events`")
 
 
 def _write_sim(folder: Path, side: Side, electronics: Electronics) -> Labels:

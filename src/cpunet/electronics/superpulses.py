@@ -23,15 +23,9 @@ import scipy.fft
 import scipy.optimize
 import scipy.signal
 
-from cpunet.electronics.baseline_methods import (
-    LONGEST_NS,
-    Kernel,
-    Spectrum,
-    Values,
-    currents,
-    fit_rc,
-    fitted,
-)
+from cpunet.electronics.baseline_methods import LONGEST_NS, Kernel, currents, fit_rc, fitted
+from cpunet.electronics.chain import ComplexArray as Spectrum
+from cpunet.electronics.chain import FloatArray as Values
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import crossings
