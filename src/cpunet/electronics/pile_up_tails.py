@@ -106,7 +106,7 @@ def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
         )
     if length < MIN_SAMPLES:
         raise CpunetError(
-            f"{length} samples before the pulses are too few for tails; give {MIN_SAMPLES} or more"
+            f"{length} samples before pulses are too few for tails; give {MIN_SAMPLES} or more"
         )
     large = prepared.scale >= np.median(prepared.scale)
     slope = float(np.median(prepared.tail_slope[large]))
