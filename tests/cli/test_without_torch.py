@@ -51,10 +51,8 @@ def test_what_networks_need_is_named(tmp_path: Path, stand):
     done = without_torch(
         f"train {' '.join(stand.inputs)} --recipe paper --out {tmp_path / 'run'}"
     )
-    assert done.stderr.splitlines()[-1] == (
-        "error: networks need torch, which is not installed; "
-        "pip install 'cpunet-hpge[networks]'"
-    )
+    said = "error: networks need torch, which is not installed; pip install 'cpunet-hpge["
+    assert done.stderr.splitlines()[-1] == f"{said}networks]'"
     assert not list(tmp_path.iterdir())
 
 
