@@ -58,14 +58,8 @@ def run(programs: list[list[str]], folder: Path) -> bool:
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory(prefix="cpunet-compiled-") as name:
         folder = Path(name)
-        np.savez(
-            folder / "hits.npz",
-            x_mm=[10.0, 12.0],
-            y_mm=[5.0, 5.0],
-            z_mm=[20.0, 21.0],
-            edep_keV=[900.0, 300.0],
-            offsets=[0, 2],
-        )
+        places = {"x_mm": [10.0, 12.0], "y_mm": [5.0, 5.0], "z_mm": [20.0, 21.0]}
+        np.savez(folder / "hits.npz", **places, edep_keV=[900.0, 300.0], offsets=[0, 2])
         if not run([["-c", program] for program in OTHERS], folder):
             sys.exit("error: lh5, dspeed or lgdo cannot be imported")
         collect = ["-m", "pytest", "--collect-only", "-q", str(ROOT / "tests")]

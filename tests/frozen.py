@@ -70,7 +70,7 @@ LANES: list[dict[str, list[str]]] = [
             " --set training.noise=baselines"
             " --set generator.width=4 --set training.iterations=20"
             " --set training.decay_start=10 --set training.log_interval=1"
-            " --set training.statistics_batches=2",
+            " --set training.statistics_batches=2"
         ],
     },
     {
@@ -80,7 +80,7 @@ LANES: list[dict[str, list[str]]] = [
         ],
         "calibrate": [
             f"calibrate {STAND.format('shifted-stand')} --events 800"
-            " --free temperature,impurity --out calibrated",
+            " --free temperature,impurity --out calibrated"
         ],
     },
     {"closure": train_and_validate("{DATA}/closure", "closure")},
@@ -92,9 +92,8 @@ def digest(array: Any) -> str:
     array = np.asarray(array)
     if array.dtype.kind in "OSU":
         array = array.astype(str)
-    return hashlib.sha256(
-        repr((array.dtype.str, array.shape)).encode() + array.tobytes()
-    ).hexdigest()[:12]
+    content = repr((array.dtype.str, array.shape)).encode() + array.tobytes()
+    return hashlib.sha256(content).hexdigest()[:12]
 
 
 def results(path: Path) -> Iterator[tuple[str, Any]]:
@@ -105,12 +104,10 @@ def results(path: Path) -> Iterator[tuple[str, Any]]:
     elif path.suffix == ".lh5":
         with h5py.File(path) as file:
             sets: dict[str, Any] = {}
-            file.visititems(
-                lambda name, item: sets.update({name: item}) if hasattr(item, "shape") else None
-            )
-            yield from (
-                (f"{path.name}:{name}", digest(item[()])) for name, item in sets.items()
-            )
+            file.visititems(lambda name, item: sets.update({name: item}))
+            for name, item in sets.items():
+                if hasattr(item, "shape"):
+                    yield f"{path.name}:{name}", digest(item[()])
     elif path.suffix == ".safetensors":
         tensors = {name: digest(tensor) for name, tensor in load_file(path).items()}
         yield path.name, digest(json.dumps(tensors, sort_keys=True))
@@ -146,15 +143,9 @@ def run_lane(lane: Mapping[str, list[str]], folder: Path) -> dict[str, dict[str,
         before = set(folder.iterdir())
         for command in commands:
             words = command.replace("{DATA}", str(DATA)).split()
-            subprocess.run(
-                [sys.executable, "-m", "cpunet", *words],
-                cwd=folder,
-                env=os.environ | threads,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                check=True,
-            )
+            how = {"cwd": folder, "env": os.environ | threads, "text": True, "check": True}
+            words = [sys.executable, "-m", "cpunet", *words]
+            subprocess.run(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, **how)
         made = sorted(set(folder.iterdir()) - before)
         found[part] = dict(item for path in made for item in results(path))
     return found
@@ -162,10 +153,9 @@ def run_lane(lane: Mapping[str, list[str]], folder: Path) -> dict[str, dict[str,
 
 def machine() -> dict[str, str]:
     """What the last bits depend on."""
-    cpu = [
-        line for line in Path("/proc/cpuinfo").read_text().splitlines() if "model name" in line
-    ]
-    found = {"processor": cpu[0].partition(":")[2].strip() if cpu else platform.processor()}
+    lines = Path("/proc/cpuinfo").read_text().splitlines()
+    cpu = next((line for line in lines if "model name" in line), "")
+    found = {"processor": cpu.partition(":")[2].strip() or platform.processor()}
     return found | {name: version(name) for name in ("numpy", "scipy", "numba", "torch")}
 
 

@@ -13,40 +13,30 @@ from cpunet.recipes.schema import Recipe
 from cpunet.training.adversarial import Game
 from cpunet.training.network_runs import generators
 from cpunet.training.views import Side, Sides
-from synthetic import NOISE_BINS, NOISE_SAMPLES, decay, edges, load_recipe, small_sides
+from synthetic import (
+    NOISE_BINS,
+    NOISE_SAMPLES,
+    decay,
+    edges,
+    load_recipe,
+    of_parts,
+    small_sides,
+)
 
 # 64-sample pulses and the narrowest networks: an iteration takes milliseconds.
-TINY = (
-    "preparation.before_ns=512",
-    "preparation.after_ns=512",
-    "preparation.baseline_ns=256",
-    "preparation.tail_ns=32",
-    "preparation.decay_fit_ns=256",
-    "generator.width=2",
-    "discriminator.embedding_rows=20",
-    "discriminator.embedding_dim=4",
-    "discriminator.hidden=4",
-    "discriminator.samples_per_step=4",
-    "training.iterations=4",
-    "training.decay_start=2",
-    "training.batch_size=4",
-    "training.cycle_size=4",
-    "training.statistics_batches=2",
-    "training.log_interval=3",
-    "training.losses.baseline_ns=256",
-    "training.losses.rising_edge_ns=384",
-    "training.losses.tail_ns=384",
-)
-SMALL = (
-    "generator.width=2",
-    "discriminator.embedding_dim=2",
-    "discriminator.hidden=2",
-    "training.iterations=4",
-    "training.batch_size=4",
-    "training.cycle_size=2",
-    "training.log_interval=2",
-    "training.held_out=0.25",
-)
+TINY = of_parts("""
+preparation before_ns=512 after_ns=512 baseline_ns=256 tail_ns=32 decay_fit_ns=256
+generator width=2
+discriminator embedding_rows=20 embedding_dim=4 hidden=4 samples_per_step=4
+training iterations=4 decay_start=2 batch_size=4 cycle_size=4 statistics_batches=2
+training log_interval=3
+training.losses baseline_ns=256 rising_edge_ns=384 tail_ns=384
+""")
+SMALL = of_parts("""
+generator width=2
+discriminator embedding_dim=2 hidden=2
+training iterations=4 batch_size=4 cycle_size=2 log_interval=2 held_out=0.25
+""")
 RMS_KEV, KEV = 4.0, 2000.0
 
 

@@ -28,8 +28,8 @@ from matplotlib.figure import Figure
 from cpunet import recipes
 from cpunet.cli import main
 from cpunet.electronics.baseline_noise import BaselineNoise, record_samples
+from cpunet.electronics.drawn_pile_up import TailsLaw, energies_at
 from cpunet.electronics.finishing import finish, padding
-from cpunet.electronics.tails_law import TailsLaw, energies_at
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.stored import Stored
@@ -55,43 +55,30 @@ def load_recipe(recipe: str, settings: Any = ()) -> Recipe:
     return recipes.load_recipe(recipe, settings).at(DT_NS)
 
 
-PREPARATION = PreparationConfig(
-    before_ns=6400,
-    after_ns=6400,
-    align_at="half_height",
-    baseline_ns=3200,
-    tail_ns=80,
-    tail_level=0.8,
-    decay_fit_ns=4800,
-    padding_before_ns=3200,
-    padding_after_ns=0,
-    saturation_run=4,
-).at(DT_NS)
+PREPARATION = load_recipe("fast").preparation
 PADDING_BEFORE, PADDING_AFTER = padding(DT_NS)
 NOISE_SAMPLES = record_samples(DT_NS)
 NOISE_BINS = NOISE_SAMPLES // 2 + 1
 # of a run that was not trained
 FACTS = {"peak": "FEP", "seed": 0, "dt_ns": DT_NS, "seconds": 1.0, "device": "cpu"}
-# settings of the narrowest networks
-SMALL_NETWORK = (
-    "generator.width=2",
-    "generator.dropout=0",
-    "discriminator.embedding_dim=2",
-    "discriminator.hidden=2",
-    "training.batch_size=4",
-    "training.statistics_batches=1",
-    "training.discriminator_interval=1",
-)
 LOSS_NAMES = (
-    "identity_data",
-    "identity_sim",
-    "cycle_forward",
-    "cycle_backward",
-    "adversarial_ren",
-    "adversarial_iren",
-    "discriminator_data",
-    "discriminator_sim",
-)
+    "identity_data", "identity_sim", "cycle_forward", "cycle_backward",
+    "adversarial_ren", "adversarial_iren", "discriminator_data", "discriminator_sim",
+)  # fmt: skip
+
+
+def of_parts(text: str) -> tuple[str, ...]:
+    """Settings of a recipe: lines of a part's name and its settings."""
+    lines = [line.split() for line in text.strip().splitlines()]
+    return tuple(f"{part}.{setting}" for part, *settings in lines for setting in settings)
+
+
+# settings of the narrowest networks
+SMALL_NETWORK = of_parts("""
+generator width=2 dropout=0
+discriminator embedding_dim=2 hidden=2
+training batch_size=4 statistics_batches=1 discriminator_interval=1
+""")
 
 
 def write_pulses(

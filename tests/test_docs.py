@@ -41,17 +41,14 @@ MADE_BY_THE_SITE = ("reference/", "../reference/")
 
 
 def blocks(*languages: str) -> list:
-    return [
-        pytest.param(
-            page,
-            code,
-            id=f"{page.relative_to(ROOT)}-{i}",
-            marks=[pytest.mark.thorough] if page.name in TOO_LONG else [],
-        )
-        for page in PAGES
-        for i, (language, code) in enumerate(BLOCK.findall(page.read_text()))
-        if language in languages
-    ]
+    found = []
+    for page in PAGES:
+        marks = [pytest.mark.thorough] if page.name in TOO_LONG else []
+        for i, (language, code) in enumerate(BLOCK.findall(page.read_text())):
+            if language in languages:
+                name = f"{page.relative_to(ROOT)}-{i}"
+                found.append(pytest.param(page, code, id=name, marks=marks))
+    return found
 
 
 def commands(code: str) -> list[list[str]]:
@@ -179,13 +176,8 @@ def test_the_python(page, code, home, monkeypatch):
 def test_the_first_tutorial_from_end_to_end(tmp_path):
     """Every command of it in turn, with fewer events and a fit that ends at once."""
     page = ROOT / "docs" / "tutorials" / "first-ren.md"
-    lines = [
-        words
-        for language, code in BLOCK.findall(page.read_text())
-        if language == ""
-        for words in commands(code)
-        if words[0] == "cpunet"
-    ]
+    texts = [code for language, code in BLOCK.findall(page.read_text()) if language == ""]
+    lines = [words for code in texts for words in commands(code) if words[0] == "cpunet"]
     assert lines[0][1] == "stand"
     for words in lines:
         if "--events" in words:
@@ -193,16 +185,10 @@ def test_the_first_tutorial_from_end_to_end(tmp_path):
         if words[1] == "train":
             words += [w for value in SHORT for w in ("--set", f"training.{value}")]
             words += ["--set", "scores.bootstraps=10"]
-        code = "from cpunet.cli import main; main()"
-        done = subprocess.run(
-            [sys.executable, "-c", code, *words[1:]],
-            cwd=tmp_path,
-            capture_output=True,
-            text=True,
-        )
-        bad = (
-            words[1] == "train" and done.returncode == 1
-        )  # so short a fit may be, and is written
+        program = [sys.executable, "-m", "cpunet", *words[1:]]
+        done = subprocess.run(program, cwd=tmp_path, capture_output=True, text=True)
+        # so short a fit may be bad, and is written
+        bad = words[1] == "train" and done.returncode == 1
         assert bad or done.returncode == 0, (words, done.stderr)
     for made in ("check.png", "run/run.json", "translated.lh5", "report/report.html"):
         assert (tmp_path / made).exists()
@@ -306,9 +292,8 @@ def test_notebooks_run_from_top_to_bottom(notebook, tmp_path, monkeypatch):
     for cell in cells(notebook):
         source = "".join(cell["source"])
         source = source.replace("FEP=2500,SEP=1000,DEP=1000", "FEP=500,SEP=120,DEP=120")
-        source = source.replace(
-            '"run", progress', 'settings={"training.steps": 1}, out="run", progress'
-        )
+        short = 'settings={"training.steps": 1}, out="run", progress'
+        source = source.replace('"run", progress', short)
         if source.startswith(BASH):
             command = ["bash", "-c", source.removeprefix(BASH)]
             subprocess.run(command, env=os.environ | {"PATH": path}, check=True)
@@ -335,11 +320,8 @@ def text_of(node: ast.AST) -> str:
 def messages() -> str:
     """All texts of the package, as the command line shows them."""
     paths = sorted((ROOT / "src").rglob("*.py"))
-    return with_options(
-        "\n".join(
-            text_of(node) for path in paths for node in ast.walk(ast.parse(path.read_text()))
-        )
-    )
+    nodes = (node for path in paths for node in ast.walk(ast.parse(path.read_text())))
+    return with_options("\n".join(map(text_of, nodes)))
 
 
 @pytest.mark.parametrize("quoted", QUOTED)

@@ -176,7 +176,7 @@ def test_traces_that_are_no_numbers(tmp_path):
     np.save(tmp_path / "pulses.npy", np.full((30, 400), np.nan))
     told = dict(info(tmp_path / "pulses.npy", read=DT).lines)
     assert told["samples"] == "values –; 30 traces not finite"
-    with pytest.raises(CpunetError, match="is no detector to draw; leave out `out`"):
+    with pytest.raises(CpunetError, match="is no detector; leave out `settings` and `out`"):
         info(tmp_path / "pulses.npy", read=DT, out=tmp_path / "e.png")
 
 

@@ -55,12 +55,8 @@ def home(tmp_path: Path) -> Path:
 
 def begin(home: Path, program: str, **variables: str) -> subprocess.Popen[str]:
     given = {"PYTHONPATH": str(home.parent), "NUMBA_CACHE_DIR": str(home.parents[1] / "code")}
-    return subprocess.Popen(
-        [sys.executable, "-c", program],
-        env=os.environ | given | variables,
-        stdout=subprocess.PIPE,
-        text=True,
-    )
+    words, environment = [sys.executable, "-c", program], os.environ | given | variables
+    return subprocess.Popen(words, env=environment, stdout=subprocess.PIPE, text=True)
 
 
 def words(process: subprocess.Popen[str]) -> list[str]:

@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stdout
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,11 +29,7 @@ from cpunet.tables import with_std
 from cpunet.translation.translator import BATCH, RejectionWarning
 from synthetic import FACTS, KEV, write_run, write_sides
 
-SHORT = {
-    "training.steps": 20,
-    "training.start_factors": [1],
-    "scores.bootstraps": 20,
-}
+SHORT = {"training.steps": 20, "training.start_factors": [1], "scores.bootstraps": 20}
 N = 260
 
 
@@ -106,6 +103,14 @@ def test_a_run(home, run):
     assert "data:image/png;base64," in html
     assert run.fit.verdict in html
     assert run.plot().axes
+    covariance = run.covariance
+    assert list(covariance) == list(covariance.index) == list(run.fit.errors)
+    errors = np.sqrt(np.diag(covariance))
+    np.testing.assert_allclose(errors, list(run.fit.errors.values()))
+    values = cpunet.compare(run, run).values
+    assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
+    with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
+        cpunet.compare(run, run.folder)
 
 
 def test_printed_numbers_agree(run, tmp_path):
@@ -164,7 +169,7 @@ def test_a_seed_gives_the_same_pulses_in_memory_in_a_file_and_of_arrays(home, ru
     assert np.array_equal(kept.waveforms, of_ren, equal_nan=True)
 
 
-def test_histogram_of_translated_pulses(home, run):
+def test_histograms_and_figures_of_translated_pulses(home, run):
     made = run.translate(home / "sim.lh5", noise=False)
     histogram = made.hist("drift_time")
     assert histogram.axes[0].name == "drift_time"
@@ -175,11 +180,7 @@ def test_histogram_of_translated_pulses(home, run):
         made.hist("drift")
     with pytest.raises(cpunet.CpunetError, match="raw traces in ADC have no parameters"):
         run.translate(home / "sim.lh5", adc=True).hist()
-
-
-def test_figures_are_drawn_where_one_says_or_for_pyplot(home, run):
-    made = run.translate(home / "sim.lh5", noise=False)
-    axes = made.plot()
+    axes = made.plot()  # for pyplot, unless one says where
     assert axes.figure is pyplot.gcf()
     assert made.hist("drift_time", bins=50).plot(ax=axes) is axes
     assert len(made.hist("drift_time", bins=50).values()) == 50
@@ -191,67 +192,23 @@ def test_figures_are_drawn_where_one_says_or_for_pyplot(home, run):
         made.hist(bins=0)
 
 
-def test_covariances_have_names(run):
-    covariance = run.covariance
-    assert list(covariance) == list(covariance.index) == list(run.fit.errors)
-    errors = np.sqrt(np.diag(covariance))
-    np.testing.assert_allclose(errors, list(run.fit.errors.values()))
-
-
-def test_runs_are_compared_by_their_readouts(run):
-    values = cpunet.compare(run, run).values
-    assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
-    with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
-        cpunet.compare(run, run.folder)
-
-
-def damaged(home, run) -> Path:
-    """A run whose calibration is something else."""
-    folder = shutil.copytree(run.folder, home / "damaged")
-    (folder / "calibration.json").write_text("[1]")
-    return folder
-
-
-WRONG = {
-    "an array": (
-        lambda home, _: cpunet.train(np.zeros((2, 9)), home / "raw.lh5", home / "new"),
-        "ndarray: are no pulses; give a path, a cpunet.PulseFile",
-    ),
-    "no pulse": (
-        lambda _, run: run.translate(Pulses.of(np.zeros((0, 900)), dt_ns=16)),
-        "memory holds no pulses",
-    ),
-    "none good": (
-        lambda _, run: run.translate(Pulses.of(np.zeros((3, 900)), dt_ns=16)),
-        r"none of 3 pulses can be translated \(3 ",
-    ),
-    "no report": (
-        lambda home, _: cpunet.Report.load(home / "run"),
-        "give the folder of a report",
-    ),
-    "no calibration": (
-        lambda home, _: cpunet.Calibration.load(home / "run"),
-        "no calibrated run",
-    ),
-    "damaged calibration": (
-        lambda home, run: cpunet.Calibration.load(damaged(home, run)),
-        r"calibration.json: damaged \(no mapping\); calibrate again",
-    ),
-    "strange setting": (
-        lambda home, _: cpunet.train(
-            home / "sim.lh5", home / "raw.lh5", home / "new", settings={"training.steps": {1}}
-        ),
-        r"training.steps: .*\(\{1\}\)",
-    ),
-}
-
-
-@pytest.mark.parametrize("case", WRONG)
-def test_what_is_wrong_is_one_line(home, run, case):
-    call, words = WRONG[case]
-    with pytest.raises(cpunet.CpunetError, match=words):
-        call(home, run)
-    assert not (home / "new").exists()
+def test_what_is_wrong_is_one_line(home, run):
+    new, nothing, strange = home / "new", np.zeros((3, 900)), {"training.steps": {1}}
+    damaged, sides = home / "damaged", (home / "sim.lh5", home / "raw.lh5")
+    shutil.copytree(run.folder, damaged)
+    (damaged / "calibration.json").write_text("[1]")
+    for words, call, *given in (
+        ("ndarray: are no pulses; give a path", cpunet.train, nothing, sides[1], new),
+        ("memory holds no pulses", run.translate, Pulses.of(nothing[:0], dt_ns=16)),
+        (r"none of 3 pulses can .* \(3 ", run.translate, Pulses.of(nothing, dt_ns=16)),
+        ("give the folder of a report", cpunet.Report.load, run.folder),
+        ("no calibrated run", cpunet.Calibration.load, run.folder),
+        (r"calibration.json: damaged \(no mapping\)", cpunet.Calibration.load, damaged),
+        (r"steps: .*\(\{1\}\)", partial(cpunet.train, settings=strange), *sides, new),
+    ):
+        with pytest.raises(cpunet.CpunetError, match=words):
+            call(*given)
+    assert not new.exists()
 
 
 def test_a_recipe_and_settings_are_not_both_given():
@@ -302,11 +259,7 @@ def test_pulses_in_memory_do_what_files_do(home, tmp_path):
     assert repr(data).startswith(f"<{N} pulses of 1200 samples, 16 ns each")
     assert list(sim.to_dataframe()) == ["event_number", "energy_kev", "peak"]
     file = cpunet.load(sim.save(tmp_path / "sim.lh5"))
-    assert (len(file), file.waveforms.shape, file.energy_kev.shape) == (
-        N,
-        sim.waveforms.shape,
-        (N,),
-    )
+    assert (file.waveforms.shape, file.energy_kev.shape) == (sim.waveforms.shape, (N,))
     assert repr(file) == f"<PulseFile {tmp_path / 'sim.lh5'}>"
     assert sum(map(len, file)) == N
     for rows in (slice(3, 9), slice(-2, None), slice(None, None, -50), slice(9, 3)):

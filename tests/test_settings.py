@@ -97,9 +97,7 @@ def test_scalars_are_those_of_yaml_1_2_and_come_back_as_written(tmp_path: Path) 
     assert key_values(["a=4.4e3", "b=[1e3, 2]"]) == {"a": 4400.0, "b": [1000.0, 2]}
     (tmp_path / "two.yaml").write_text(yaml_text(values), encoding="utf-8")
     assert read_values(tmp_path / "two.yaml") == values
-
-
-def test_a_byte_order_mark_is_no_part_of_a_file(tmp_path: Path) -> None:
+    # a byte order mark is no part of a file
     (tmp_path / "one.yaml").write_text("a: 1  # H\u00f6he\n", "utf-8-sig")
     assert read_values(tmp_path / "one.yaml") == {"a": 1}
 

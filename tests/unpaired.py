@@ -23,13 +23,9 @@ DT_NS, FINE_NS, FINE_PER_SAMPLE = 16.0, 2.0, 8
 KEV, NOISE_KEV = 2614.5, 1.95
 N = 600
 # Slow part and decays are such that the response can describe the chain exactly.
-CHAIN = Electronics.model_validate(
-    read_electronics("legend200").model_dump()
-    | {
-        "bandwidth_poles_ns": (55, 35),
-        "slow": {"fraction": 0.065, "tau_ns": 400.0},
-        "decays": [{"fraction": 1.0, "tau_us": 80.0}],
-    }
+CHAIN = read_electronics(
+    "legend200",
+    ["bandwidth_poles_ns=[55, 35]", "slow.tau_ns=400", "decays=[{fraction: 1, tau_us: 80}]"],
 )
 RECIPE = load_recipe("fast")
 

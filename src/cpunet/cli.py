@@ -21,14 +21,8 @@ from functools import cache
 from types import FrameType
 from typing import Any
 
-from cyclopts import (
-    App,
-    CycloptsError,
-    MissingArgumentError,
-    Parameter,
-    UnknownCommandError,
-    default_name_transform,
-)
+import cyclopts
+from cyclopts import App, Parameter
 
 import cpunet
 from cpunet import DISTRIBUTION, other_package
@@ -40,21 +34,18 @@ log = logging.getLogger(__name__)
 # What a command does. Its public function has the same name, or one of these.
 COMMANDS = {
     "demo": "Simulate, digitise, train, translate and validate on a stand with a given answer.",
-    "check": "Say whether simulated and measured pulses can be compared, and what to do if "
-    "not.",
+    "check": "Say whether simulated and measured pulses can be compared, or what to do.",
     "export legend": "Export a readout chain as parameters for LEGEND's simulation chain.",
     "export onnx": "Export the deterministic part of a run as ONNX.",
     "import": "Make a run of the weights that the authors published.",
     "info": "Say what is in a file, detector, run or report.",
     "response": "Say in terms of physics what readout was learned, with the truth if given.",
     "library make": "Simulate the charge pulse of every place in a detector.",
-    "library translate": "Translate a library of charge pulses with a trained run, without "
-    "noise.",
+    "library translate": "Translate a library of charge pulses with a run, without noise.",
     "simulate": "Simulate pulses of a detector, from hits of a file or of Tl-208 gammas.",
     "stand": "Make a test stand: simulated pulses, raw traces of other events, and the truth.",
     "train": "Train REN and IREN on simulated and measured pulses, unpaired.",
-    "translate": "Translate pulses with a trained run, keeping the rows and columns of their "
-    "files.",
+    "translate": "Translate pulses with a trained run; rows and columns of files stay.",
     "calibrate": "Calibrate the detector and its electronics together.",
     "validate": "Score a run per peak and write a report.",
     "compare": "Compare the scores of several validations.",
@@ -83,7 +74,7 @@ NO_MEMORY = ("allocate memory", "out of memory", "unable to allocate")
 
 
 def _option(name: str) -> str:
-    return SHORT.get(name) or default_name_transform(name)
+    return SHORT.get(name) or cyclopts.default_name_transform(name)
 
 
 def with_options(text: str) -> str:
@@ -98,10 +89,7 @@ app = App(
     version=f"cpunet {cpunet.__version__}",
     # of "a path or an object", the command line takes paths
     default_parameter=Parameter(
-        accepts_keys=False,
-        consume_multiple=False,
-        name_transform=_option,
-        negative_iterable=(),
+        accepts_keys=False, consume_multiple=False, name_transform=_option, negative_iterable=()
     ),
     result_action="return_value",
 )
@@ -142,20 +130,20 @@ def run(words: Sequence[str]) -> int:
     called = app if not words or words[0].startswith("-") else application()
     try:
         result: Any = called(words, exit_on_error=False, print_error=False)
-    except CycloptsError as error:
+    except cyclopts.CycloptsError as error:
         command = " ".join(["cpunet", *(error.command_chain or ())])
         text = " ".join(str(error).split())
-        if isinstance(error, UnknownCommandError):  # more words list the first of all commands
+        # more words list the first of all commands
+        if isinstance(error, cyclopts.UnknownCommandError):
             text = text.partition(" Available commands")[0]
-        if isinstance(error, MissingArgumentError) and error.argument is not None:
+        if isinstance(error, cyclopts.MissingArgumentError) and error.argument is not None:
             text = f"{error.argument.names[0]} is missing"
         raise CpunetError(text.rstrip("."), f"see {command} --help") from error
     except CpunetError as error:
         raise CpunetError(with_options(str(error))) from error
     if HELP.intersection(words):
-        sys.stdout.writelines(
-            f"{line}\n" for line in examples([w for w in words if w[0] != "-"])
-        )
+        called_for = [word for word in words if word[0] != "-"]
+        sys.stdout.writelines(f"{line}\n" for line in examples(called_for))
     if not words or (words[0] in GROUPS and len(words) == 1):
         return USAGE  # the help was shown
     if result is not None:
@@ -241,18 +229,17 @@ def _ended_with(error: BaseException, words: Sequence[str], *, debug: bool) -> i
     if isinstance(error, BrokenPipeError):  # nobody reads on, as in "cpunet … | head"
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BUG
-    stopped = isinstance(error, KeyboardInterrupt | SystemExit)
-    if debug and not stopped:
+    if isinstance(error, KeyboardInterrupt | SystemExit):
+        code = error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT
+        status = code if isinstance(code, int) else BUG
+        if status in (128 + number for number in STOPPING):
+            log.error("interrupted; nothing half-written was left")
+        return status
+    if debug:
         traceback.print_exception(error)
     files = ", ".join(word for word in words if os.path.exists(word))  # noqa: PTH110
     about = f"{files}: " if files else ""
-    if stopped:
-        code = error.code if isinstance(error, SystemExit) else 128 + signal.SIGINT
-        status = code if isinstance(code, int) else BUG
-        if status not in (128 + number for number in STOPPING):
-            return status
-        text = "interrupted; nothing half-written was left"
-    elif isinstance(error, CpunetError):
+    if isinstance(error, CpunetError):
         pass
     elif isinstance(error, MemoryError) or any(part in text.lower() for part in NO_MEMORY):
         text = f"{about}out of memory ({text[:200]}); take fewer pulses, or smaller batches"
@@ -261,10 +248,8 @@ def _ended_with(error: BaseException, words: Sequence[str], *, debug: bool) -> i
         about = f"{error.filename}: "[-200:] if error.filename else about
         text = f"{about}{os.strerror(error.errno)}; {remedy}, or choose another place"
     else:
-        text, status = (
-            f"{about}unexpected {type(error).__name__} ({text[:200]}); please report it to the "
-            f"makers of {DISTRIBUTION}, with what {DEBUG} prints",
-            BUG,
-        )
+        what, status = f"{about}unexpected {type(error).__name__} ({text[:200]})", BUG
+        remedy = f"report it to the makers of {DISTRIBUTION}, with what {DEBUG} prints"
+        text = f"{what}; please {remedy}"
     log.error(text)
     return status

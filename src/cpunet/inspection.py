@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import TYPE_CHECKING, TypeAlias
 
 import cpunet
 from cpunet.errors import CpunetError
@@ -130,12 +130,42 @@ def info(
 
     cpunet info hits.csv --units mm,keV
     """
+    place, values, recipe = Path(path), key_values(settings), load_recipe("fast")
     if out is not None:
         refuse_picture(Path(out), path, read.energy, force=force)
-    content = look(path, read, units, key_values(settings), quality)
-    if out is not None:
-        content.save(out, force)
-    return content
+    if holds_detector(path):
+        from cpunet.simulation.fields import compute_fields, fields_in_words
+
+        detector = read_detector(path, values)
+        fields = compute_fields(detector)
+
+        def draw() -> Figure:
+            from cpunet.simulation.detector_figure import detector_figure
+
+            return detector_figure(detector, fields)
+
+        of_detector = InfoResult(str(path), fields_in_words(detector, fields), _draw=draw)
+        if out is not None:
+            of_detector.save(out, force)
+        return of_detector
+    if out is not None or values:
+        raise CpunetError(f"{path}: is no detector", "leave out `settings` and `out`")
+    if place.is_dir():
+        content = load(path)
+        if isinstance(content, cpunet.Run):
+            return InfoResult(str(path), content.summary())
+        verdicts = getattr(content, "verdicts", None)
+        lines = [("report", str(path)), *(("", verdict) for verdict in verdicts or ())]
+        return InfoResult(str(path), lines if verdicts else [("", str(content))])
+    try:
+        return _file(pulse_file(path, read), recipe, quality)
+    except CpunetError:
+        if not holds_hits(path):
+            raise
+    lines = [("file", str(path))]
+    for name, topics in describe_hits(place, recipe.peaks, units).items():
+        lines += [("detector", name), *topics]
+    return InfoResult(str(path), lines)
 
 
 def load(path: str | Path) -> Loaded:
@@ -169,49 +199,6 @@ def load(path: str | Path) -> Loaded:
         f"{path}: no folder of this program",
         "give the folder of a run, which holds run.json, of a report or stand, or a file",
     )
-
-
-def look(
-    path: str | Path,
-    read: FileOptions,
-    units: str,
-    settings: Mapping[str, Any],
-    quality: bool,
-) -> InfoResult:
-    """What is in a file, detector or folder; see `info`."""
-    place, recipe, no_pulses = Path(path), load_recipe("fast"), None
-    if place.is_file() and not settings:  # most are pulses: these are opened once
-        try:
-            return _file(pulse_file(path, read), recipe, quality)
-        except CpunetError as error:
-            no_pulses = error
-    if holds_detector(path):
-        from cpunet.simulation.fields import compute_fields, fields_in_words
-
-        detector = read_detector(path, settings)
-        fields = compute_fields(detector)
-
-        def draw() -> Figure:
-            from cpunet.simulation.detector_figure import detector_figure
-
-            return detector_figure(detector, fields)
-
-        return InfoResult(str(path), fields_in_words(detector, fields), _draw=draw)
-    if settings:
-        raise CpunetError(f"{path}: is no detector", "leave out `settings`")
-    if place.is_dir():
-        content = load(path)
-        if isinstance(content, cpunet.Run):
-            return InfoResult(str(path), content.summary())
-        verdicts = getattr(content, "verdicts", None)
-        lines = [("report", str(path)), *(("", verdict) for verdict in verdicts or ())]
-        return InfoResult(str(path), lines if verdicts else [("", str(content))])
-    if holds_hits(path):
-        lines = [("file", str(path))]
-        for name, topics in describe_hits(place, recipe.peaks, units).items():
-            lines += [("detector", name), *topics]
-        return InfoResult(str(path), lines)
-    raise no_pulses or CpunetError(f"{path}: no such file; check the name")
 
 
 def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:

@@ -7,6 +7,8 @@ import json
 import re
 import reprlib
 from collections.abc import Iterable, Iterator, Mapping
+from functools import reduce
+from operator import getitem
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, TypeAlias, TypeVar, get_args, get_origin
 
@@ -82,10 +84,7 @@ C = TypeVar("C", bound=Config)
 
 
 def read_settings(
-    kind: type[C],
-    name: str | Path | C,
-    set_: Set = (),
-    folder: Path | None = None,
+    kind: type[C], name: str | Path | C, set_: Set = (), folder: Path | None = None
 ) -> C:
     """Read settings by name or from a file, and override single values.
 
@@ -107,12 +106,10 @@ def read_settings(
         source, values = "settings", name.model_dump(exclude_unset=True)
     for key, value in key_values(set_).items():
         *parents, last = key.split(".")
-        node = values
-        for parent in parents:
-            node = node.get(parent) if isinstance(node, dict) else None  # type: ignore[assignment]
-        if not isinstance(node, dict):
-            raise CpunetError(f"{source}: {key}: no such setting")
-        node[last] = value
+        try:
+            reduce(getitem, parents, values)[last] = value
+        except (LookupError, TypeError) as error:
+            raise CpunetError(f"{source}: {key}: no such setting") from error
     return checked(kind, values, source)
 
 
@@ -199,9 +196,8 @@ def read_text(name: str | Path, folder: Path | None = None) -> str:
 
 def read_values(name: str | Path, folder: Path | None = None) -> dict[str, Any]:
     """Read a mapping from a YAML or JSON file, see `read_text`."""
-    text = read_text(name, folder)
     is_json = Path(name).suffix.lower() == ".json"  # may be indented with tabs
-    values = _parsed(text, str(name), is_json=is_json)
+    values = _parsed(read_text(name, folder), str(name), is_json=is_json)
     if not isinstance(values, dict):
         raise CpunetError(f"{name}: holds no settings; write lines such as dt_ns: 16")
     return values
@@ -267,7 +263,7 @@ def _fault(
             fields = [of.model_fields[name] for of in kinds if name in of.model_fields]
             kinds = set().union(*(_kinds(field.annotation) for field in fields))
             kinds = {of for of in kinds if isinstance(of, type) and issubclass(of, Config)}
-        names = list(dict.fromkeys(name for of in kinds for name in of.model_fields))
+        names = [*dict.fromkeys(name for of in kinds for name in of.model_fields)]
         near = difflib.get_close_matches(str(keys[-1]), names, 1)
         hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(names)}"
         return f"{key[:60]}: no such setting; {hint}"

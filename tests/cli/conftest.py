@@ -12,27 +12,27 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from synthetic import after_pole_and_decay, in_traces, status_of, waveform_table, write_table
+from synthetic import (
+    after_pole_and_decay,
+    in_traces,
+    of_parts,
+    status_of,
+    waveform_table,
+    write_table,
+)
 
 DT_NS = 16.0
 PEAKS_KEV = {"DEP": 1592.511, "SEP": 2103.511, "FEP": 2614.511}
 PER_PEAK = 24
 
 # The narrowest networks and the shortest training there are.
-TINY = [
-    "generator.width=2",
-    "discriminator.embedding_rows=20",
-    "discriminator.embedding_dim=2",
-    "discriminator.hidden=2",
-    "discriminator.samples_per_step=80",
-    "training.iterations=4",
-    "training.decay_start=2",
-    "training.batch_size=4",
-    "training.discriminator_interval=1",
-    "training.statistics_batches=2",
-    "training.log_interval=3",
-    "scores.bootstraps=20",
-]
+TINY = of_parts("""
+generator width=2
+discriminator embedding_rows=20 embedding_dim=2 hidden=2 samples_per_step=80
+training iterations=4 decay_start=2 batch_size=4 discriminator_interval=1 statistics_batches=2
+training log_interval=3
+scores bootstraps=20
+""")
 TINY_OPTIONS = ["--recipe", "published", *(word for value in TINY for word in ("--set", value))]
 
 Waveforms = npt.NDArray[Any]

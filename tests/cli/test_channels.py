@@ -78,13 +78,8 @@ def test_train_validate_and_translate_all(command, stand, raw, tiny, tmp_path, u
     assert sorted(file.name for file in both.glob("*.lh5")) == ["ch1.lh5", "ch2.lh5"]
 
     # every option reaches the channels
-    refused = command(
-        "translate",
-        tmp_path / "runs",
-        raw,
-        *(*words[:3], "--pile-up-khz", 1),
-        *("--out", tmp_path / "piled"),
-    )
+    piled = [*words[:3], "--pile-up-khz", 1, "--out", tmp_path / "piled"]
+    refused = command("translate", tmp_path / "runs", raw, *piled)
     assert "leave out --pile-up-khz" in refused.out + refused.err
 
     again = command("train", *files, "--out", tmp_path / "runs", *tiny, "--resume")

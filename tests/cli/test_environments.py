@@ -88,7 +88,7 @@ def test_a_signal_that_is_ignored_stays_so(command, stand, monkeypatch, name):
     signal.signal(number, before := signal.SIG_IGN)
     try:
         with monkeypatch.context() as patched:
-            patched.setattr("cpunet.inspection.look", arrive)
+            patched.setattr("cpunet.inspection.pulse_file", arrive)
             command("info", stand.sim)
         assert signal.getsignal(number) == before
     finally:

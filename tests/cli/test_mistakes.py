@@ -29,7 +29,6 @@ NEEDED = {
     "train": {"--recipe": "fast", "--sim": "sim.lh5", "--data": "data.lh5", "--out": "out"},
     "simulate": {"--detector": "ppc.yaml", "--hits": "hits.npz", "--out": "out"},
 }
-TRAIN, SIMULATE = NEEDED
 WRITE = "translate run sim.lh5 --no-noise --out out.lh5"
 Patch = Callable[[pytest.MonkeyPatch], None]
 
@@ -58,53 +57,36 @@ def signalled(number: int) -> Patch:
     return lambda patch: patch.setattr("pathlib.Path.replace", arrive)
 
 
-DESCRIBE = "cpunet.inspection.look"
+DESCRIBE = "cpunet.inspection.pulse_file"
 NAMES = ("INT", "TERM", "HUP", "QUIT", "USR1", "USR2", "XCPU")  # some of batch systems
 SIGNALS = [getattr(signal, f"SIG{name}") for name in NAMES]
 FULL = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-MISTAKES = {
-    # files
-    "wrong path": Mistake("info none.lh5", r"none.lh5: no such file; check the name"),
-    "brackets and colons": Mistake(
-        "info 'none[bold]:key:[/bold].lh5'", r"none\[bold\]:key:\[/bold\].lh5: no such file; .*"
-    ),
-    "folder for a file": Mistake(
-        "translate run folder --out out", r"folder: is a folder; give a file of pulses"
-    ),
-    "file for a folder": Mistake(
-        "translate sim.lh5 sim.lh5 --out out", r"sim.lh5: no finished run .*; make it with .*"
-    ),
-    # energies and sides
-    "negative energies": Mistake(
-        f"{TRAIN} --data negative.lh5", r"negative.lh5: .*; check the calibration .*-2102"
-    ),
-    "no energies": Mistake(f"{TRAIN} --data none-at-all.lh5", r"none-at-all.lh5: .*; .*"),
-    "sides swapped": Mistake(
-        "train --sim data.lh5 --data sim.lh5 --out out",
-        r"sim.lh5: given as measured pulses, but these look simulated.*swapped.*--insist.*",
-    ),
-    "translated already": Mistake(
-        f"{TRAIN} --sim translated.lh5", r"translated.lh5: .*translated.*; .*"
-    ),
-    # selection
-    "a negative seed": Mistake(
-        f"{SIMULATE} --seed=-1", r"--seed: -1 is not from 0 to 4294967295"
-    ),
-    "constant pulses": Mistake(
-        f"{TRAIN} --data constant.lh5", r"constant.lh5: .*constant.*; .*"
-    ),
-    "saturated pulses": Mistake(
-        f"{TRAIN} --data saturated.lh5", r"saturated.lh5: .*saturated.*; .*"
-    ),
-    "too few pulses": Mistake(
-        f"{TRAIN} --data few.lh5",
-        r"24 simulated and 2 measured pulses; 200 of each .* are needed: select more.*",
-    ),
-    # outputs
-    "output in a file": Mistake(
-        "translate run sim.lh5 --out text.lh5/out.lh5",
-        r"text.lh5/out.lh5: cannot be written \(.*\); .*choose another place",
-    ),
+# Words of a command, and the line that it ends in.
+PLAIN = r"""
+info 'none[b]:key:[/b].lh5' | none\[b\]:key:\[/b\].lh5: no such file; check the name
+info metres.yaml | metres.yaml: .*
+info sim.lh5 --tabel x | .*--tabel.*; see .*--help
+train --data negative.lh5 | negative.lh5: .*; check the calibration .*-2102
+train --data none-at-all.lh5 | none-at-all.lh5: .*; .*
+train --sim data.lh5 --data sim.lh5 | sim.lh5: .* measured .* simulated.*swapped.*--insist.*
+train --sim translated.lh5 | translated.lh5: .*translated.*; .*
+train --data constant.lh5 | constant.lh5: .*constant.*; .*
+train --data saturated.lh5 | saturated.lh5: .*saturated.*; .*
+train --data few.lh5 | 24 simulated and 2 measured pulses; 200 of each .* needed: select more.*
+simulate --seed=-1 | --seed: -1 is not from 0 to 4294967295
+simulate --hits noenergy.npz | noenergy.npz: .*
+stand --preset ornl --detector V9 --out o | V9: neither a file nor one of .*ppc.*
+translate run folder --out out | folder: is a folder; give a file of pulses
+translate sim.lh5 sim.lh5 --out out | sim.lh5: no finished run .*; make it with .*
+translate report sim.lh5 --out out | report: no finished run .*; make it with .*
+translate halfrun sim.lh5 --out out | halfrun.*; .*
+translate run sim.lh5 --out text.lh5/o | text.lh5/o: cannot be written \(.*\); .*another place
+"""
+MISTAKES = {row: Mistake(*row.split(" | ")) for row in PLAIN.strip().splitlines()} | {
+    f"stopped by {n.name}": Mistake(WRITE, r"interrupted; .*", signalled(n), 128 + n)
+    for n in SIGNALS
+}
+MISTAKES |= {
     "disk full": Mistake(
         WRITE,
         r"out.lh5: cannot be written \(No space left on device\); make room there, or .*",
@@ -115,31 +97,8 @@ MISTAKES = {
         r"sim.lh5: No space left on device; make room, or choose another place",
         failing(DESCRIBE, FULL),
     ),
-    **{
-        f"stopped by {number.name}": Mistake(
-            WRITE, r"interrupted; .*", signalled(number), 128 + number
-        )
-        for number in SIGNALS
-    },
-    # runs and reports
-    "half a run": Mistake("translate halfrun sim.lh5 --out out", r"halfrun.*; .*"),
-    "a report for a run": Mistake(
-        "translate report sim.lh5 --out out", r"report: no finished run .*; make it with .*"
-    ),
-    # settings
-    "unknown recipe": Mistake(
-        f"{TRAIN} --recipe papr", r"papr: neither a file nor one of .*paper.*"
-    ),
-    "unknown option": Mistake("info sim.lh5 --tabel x", r".*--tabel.*; see .*--help"),
-    # simulation
-    "unknown detector": Mistake(
-        "stand --preset ornl --detector V9 --out o", r"V9: neither a file nor one of .*ppc.*"
-    ),
-    "metres for millimetres": Mistake("info metres.yaml", r"metres.yaml: .*"),
-    "hits without energies": Mistake(f"{SIMULATE} --hits noenergy.npz", r"noenergy.npz: .*"),
-    # machine
     "no GPU": Mistake(
-        f"{TRAIN} --recipe paper --device cuda",
+        "train --recipe paper --device cuda",
         r"no GPU; use --device cpu or install .*",
         lambda patch: patch.setattr("torch.cuda.is_available", lambda: False),
     ),
@@ -176,10 +135,8 @@ def fill(folder: Path, stand) -> None:
     few = np.where(np.arange(len(kev)) < 9, kev, 1000)
     scaled = 8000 + (waves - 8000.0) * (few / kev)[:, np.newaxis]
     stand.write(folder / "few.lh5", "geds/raw", np.round(scaled).astype(np.uint16), few)
-    for name, pulses in {
-        "constant": 0 * waves + 8000,
-        "saturated": waves.clip(0, 20_000),
-    }.items():
+    bad = {"constant": 0 * waves + 8000, "saturated": waves.clip(0, 20_000)}
+    for name, pulses in bad.items():
         stand.write(folder / f"{name}.lh5", "geds/raw", pulses, kev)
     with h5py.File(folder / "none-at-all.lh5", "r+") as file:
         del file["geds/raw/energy"]

@@ -176,13 +176,8 @@ def home(stand, tmp_path_factory):
         with h5py.File(folder / f"{name}.h5", "w") as file:
             file[array] = waves
     x = np.array([5.0, 6.0, 9.0])
-    hits = {
-        "x_mm": x,
-        "y_mm": 0 * x,
-        "z_mm": x,
-        "offsets": np.arange(4),
-        "edep_keV": 0 * x + 900,
-    }
+    hits = {"x_mm": x, "y_mm": 0 * x, "z_mm": x, "edep_keV": 0 * x + 900}
+    hits["offsets"] = np.arange(4)
     np.savez(folder / "hits.npz", **hits)
     np.savez(folder / "far.npz", **(hits | {"z_mm": x + 500}))
     columns = {"event": [0, 1, 2] * 2, "x": [*x, *x], "y": [0.0] * 6, "z": [*x, *x]}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -33,13 +32,8 @@ for words in sys.argv[1:]:
 
 def without_torch(*commands: str) -> subprocess.CompletedProcess[str]:
     """Run commands where torch cannot be imported."""
-    return subprocess.run(
-        [sys.executable, "-c", PROGRAM, *commands],
-        capture_output=True,
-        text=True,
-        check=False,
-        env=os.environ | {"PYTHONWARNINGS": "error"},
-    )
+    words = [sys.executable, "-W", "error", "-c", PROGRAM, *commands]
+    return subprocess.run(words, capture_output=True, text=True, check=False)
 
 
 def test_a_readout_is_used_without_torch(tmp_path: Path, stand):
@@ -57,10 +51,8 @@ def test_what_networks_need_is_named(tmp_path: Path, stand):
     done = without_torch(
         f"train {' '.join(stand.inputs)} --recipe paper --out {tmp_path / 'run'}"
     )
-    assert done.stderr.splitlines()[-1] == (
-        "error: networks need torch, which is not installed; "
-        "pip install 'cpunet-hpge[networks]'"
-    )
+    said = "error: networks need torch, which is not installed; pip install 'cpunet-hpge["
+    assert done.stderr.splitlines()[-1] == f"{said}networks]'"
     assert not list(tmp_path.iterdir())
 
 

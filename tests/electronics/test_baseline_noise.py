@@ -23,8 +23,9 @@ from synthetic import load_recipe
 
 CONFIG = load_recipe("paper").preparation
 DT_NS = 16.0
-ADC_PER_KEV = 15.0
-NOISE_KEV = 1.5
+ADC_PER_KEV, NOISE_KEV = 15.0, 1.5
+# Prepared pulses are scaled to 0.8 of a tail that has decayed by 11 %.
+TO_PREPARED = 0.8 / np.exp(-397 * DT_NS / 54_600)
 
 
 def coloured(n: int, length: int, rng: np.random.Generator) -> np.ndarray:
@@ -58,9 +59,7 @@ def noise() -> BaselineNoise:
 def test_noise_has_the_variance_and_correlation_of_the_baselines(noise) -> None:
     energy = np.full(400, 2614.5)
     drawn = noise.draw(energy, 1200, np.random.default_rng(1)) * 2614.5
-    # prepared pulses are scaled to 0.8 of a tail that has decayed by 11 %
-    scale = 0.8 / np.exp(-397 * DT_NS / 54_600)
-    assert drawn.std() == pytest.approx(NOISE_KEV * scale, rel=0.03)
+    assert drawn.std() == pytest.approx(WANTED, rel=0.03)
     for lag in (1, 3, 8):
         correlation = (drawn[:, lag:] * drawn[:, :-lag]).mean() / drawn.var()
         assert correlation == pytest.approx(0.8**lag, abs=0.03)
@@ -73,18 +72,17 @@ def test_the_error_of_the_rms_covers_the_truth() -> None:
     found = [
         BaselineNoise.of(Baselines.of([traces(100, seed)], CONFIG)) for seed in range(20, 40)
     ]
-    true = NOISE_KEV * 0.8 / np.exp(-397 * DT_NS / 54_600)
     errors = np.array([noise.rms_error for noise in found])
-    pulls = (np.array([noise.rms for noise in found]) - true) / errors
-    assert np.median(errors) < 0.03 * true
+    pulls = (np.array([noise.rms for noise in found]) - WANTED) / errors
+    assert np.median(errors) < 0.03 * WANTED
     assert 0.5 < np.sqrt((pulls**2).mean()) < 1.5
 
 
 def test_pulses_finished_without_noise_and_with_it_at_once(noise) -> None:
     records = shape(600, 1200).astype(np.float32)
     records[3] = 0  # cannot be prepared
-    given = {"dt_ns": DT_NS, "noise": noise, "energy_kev": np.full(600, 1592.5), "seed": 3}
-    noisy, _, clean, _ = finish(records, CONFIG, **given)
+    kev = np.full(600, 1592.5)
+    noisy, _, clean, _ = finish(records, CONFIG, dt_ns=DT_NS, noise=noise, energy_kev=kev)
     np.testing.assert_array_equal(clean, finish(records, CONFIG, dt_ns=DT_NS).windows)
     assert np.isnan(noisy[3]).all()
 
@@ -100,10 +98,7 @@ def test_bad_input_is_named(noise) -> None:
         finish(records, CONFIG, dt_ns=8.0, noise=noise, energy_kev=np.ones(3))
 
 
-GRID = 8192
-SPECTRUM = read_electronics("legend200").noise.spectrum
-# a step of 1 has come down to this where prepared pulses are 0.8
-TO_PREPARED = 0.8 / np.exp(-397 * DT_NS / 54_600)
+GRID, SPECTRUM = 8192, read_electronics("legend200").noise.spectrum
 
 
 def on_baselines(baselines: np.ndarray, kev: float = 2000.0) -> Pulses:
@@ -121,10 +116,8 @@ def test_noise_slower_than_a_baseline_is_found() -> None:
     drawn = noise.draw(np.ones(1500), 1200, np.random.default_rng(7)) / TO_PREPARED
     # mean square differences within a baseline, of some 500 samples, and twice as far apart
     for apart, tolerance in ((4, 0.05), (100, 0.05), (400, 0.07), (1100, 0.15)):
-        drift, wanted = (
-            ((each[:, apart:] - each[:, :-apart]) ** 2).mean() for each in (drawn, baselines)
-        )
-        assert drift == pytest.approx(wanted, rel=tolerance)
+        drifts = [((x[:, apart:] - x[:, :-apart]) ** 2).mean() for x in (drawn, baselines)]
+        assert drifts[0] == pytest.approx(drifts[1], rel=tolerance)
     # all the power below a baseline's lowest frequency, 125 kHz
     power = noise_power(SPECTRUM, DT_NS, GRID)
     frequency_mhz = scipy.fft.rfftfreq(GRID, DT_NS * 1e-3)

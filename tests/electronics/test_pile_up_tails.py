@@ -9,15 +9,16 @@ import pytest
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.drawn_pile_up import SIZES_KEV, DrawnTails, TraceNoise, passing
-from cpunet.electronics.pile_up_tails import PileUpTails
-from cpunet.electronics.readout import RawTraces, read_out
-from cpunet.electronics.tails_law import (
+from cpunet.electronics.drawn_pile_up import (
+    SIZES_KEV,
+    DrawnTails,
     TailsLaw,
-    characteristic_exponents,
+    TraceNoise,
     energies_at,
-    fit_rate,
 )
+from cpunet.electronics.measured import passing
+from cpunet.electronics.pile_up_tails import PileUpTails, characteristic_exponents, fit_rate
+from cpunet.electronics.readout import RawTraces, read_out
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
@@ -60,12 +61,14 @@ RECIPE = load_recipe("fast")
 PREPARATION = RECIPE.preparation
 
 
-def traces_of(rate_khz: float, preset: str = "ornl", n: int = 2000) -> RawTraces:
+def traces_of(
+    rate_khz: float, preset: str = "ornl", n: int = 2000, **values: object
+) -> RawTraces:
     rng = np.random.default_rng(1)
     ramps = np.clip(np.arange(300) / rng.uniform(40, 120, (n, 1)), 0, 1)
     energy = rng.choice([1592.5, 2103.5, 2614.5], n)
     rates = {"earlier_pulses.rate_kHz": rate_khz, "pile_up.rate_kHz": 0.4}
-    chain = read_electronics(preset, rates)
+    chain = read_electronics(preset, rates | values)
     return read_out(Pulses.of(ramps, dt_ns=4, energy_kev=energy), chain, seed=2)
 
 
@@ -116,12 +119,14 @@ def test_nothing_is_invented_where_there_is_nothing(preset: str):
     assert found.describe().rate_khz == 0
 
 
-def test_levels_that_tell_nothing_are_left_out(busy: RawTraces):
+def test_levels_that_tell_nothing_are_left_out():
     """Behind a capacitor levels say nothing: here each trace has lost its own."""
+    # a single decay: that of tails is taken from the pulses'
+    busy = traces_of(1.0, decays=[{"fraction": 1, "tau_us": 54.6}])
     raw = as_pulses(busy)
     lost = 8000 + raw.waveforms - raw.waveforms[:, :400].mean(axis=1, keepdims=True)
     blocks = [raw.with_waveforms(lost.astype(np.float32))]
-    found = PileUpTails.of(Baselines.of(blocks, PREPARATION), decay_us=54.6)
+    found = PileUpTails.of(Baselines.of(blocks, PREPARATION))
     assert not found.level_weight
     assert found.describe().told_by == "slope"
     large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.tails_kev > 100)

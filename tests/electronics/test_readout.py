@@ -11,8 +11,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
 
-from cpunet.electronics.chain import Electronics, NoiseSpectrum, read_electronics
-from cpunet.electronics.exponentials import Exponentials, moved_apart
+from cpunet.electronics.chain import (
+    Electronics,
+    Exponentials,
+    NoiseSpectrum,
+    moved_apart,
+    read_electronics,
+)
+from cpunet.electronics.drawn_pile_up import TailsLaw
 from cpunet.electronics.finishing import record_length, with_room
 from cpunet.electronics.readout import (
     by_height,
@@ -22,7 +28,6 @@ from cpunet.electronics.readout import (
     noise_power,
     read_out,
 )
-from cpunet.electronics.tails_law import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
 from synthetic import PADDING_BEFORE, load_recipe, mean_kev, one_line
@@ -45,7 +50,7 @@ def rise_ns(step: np.ndarray) -> float:
     st.floats(0.01, 0.2),
 )
 def test_step_is_that_of_the_rational_transfer_function(taus: list[float], fraction: float):
-    chain = Exponentials.mixed(fraction, 500.0)
+    chain = Exponentials.low_pass(500.0, fraction)
     numerator, denominator = np.array([(1 - fraction) * 500, 1.0]), np.array([500.0, 1.0])
     for tau, apart in zip(taus, moved_apart(taus), strict=True):
         chain = chain * Exponentials.low_pass(apart)

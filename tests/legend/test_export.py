@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import yaml
 
-from cpunet.electronics.exponentials import Exponentials
+from cpunet.electronics.chain import Exponentials
 from cpunet.errors import CpunetError
 from cpunet.legend.export import equivalent_kernel, export_legend, kernel_step
 from synthetic import write_chain
@@ -133,7 +133,7 @@ def test_a_kernel_is_a_step_of_both_and_is_its_own_nearest() -> None:
 
 def test_what_two_numbers_cannot_follow_is_told() -> None:
     fast = Exponentials.low_pass(45.0) * Exponentials.low_pass(30.0)
-    slow = fast * Exponentials.mixed(0.06, 800.0)
+    slow = fast * Exponentials.low_pass(800.0, 0.06)
     without, found = (equivalent_kernel(chain.step) for chain in (fast, slow))
     # half of the slow charge is still to come when the peak is over by 500 ns
     late = "late_charge_percent"

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.electronics.tails_law import TailsLaw
+from cpunet.electronics.drawn_pile_up import TailsLaw
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run

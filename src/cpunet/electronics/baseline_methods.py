@@ -13,21 +13,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
-import numpy.typing as npt
 import scipy.fft
 import scipy.optimize
 import scipy.signal
 
+from cpunet.electronics.chain import ComplexArray as Spectrum
+from cpunet.electronics.chain import FloatArray as Values
 from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, blocks
 from cpunet.pulses.parameters import current_amplitude, tail_slope
-
-Values = npt.NDArray[np.float64]
-Spectrum = npt.NDArray[np.complex128]
 
 MIN_PULSES = 50  # of either dataset, for a fit
 TAIL_SHARE = 0.75  # of the time after the alignment: 4.8 of 6.4 us, as in the paper
@@ -52,7 +49,7 @@ class BaselineMethod:
     tail_slope_per_ms
         Logarithmic slope of the tail in 1/ms, negative for a decay.
     transfer
-        Transfer function of the kernel at the frequencies of a record of a number of samples.
+        Transfer function of the kernel at the frequencies of a record, see `currents`.
     values
         Fitted values of the kernel by name. Each name ends with the unit.
 
@@ -61,7 +58,7 @@ class BaselineMethod:
     Without a kernel, a step decays exponentially.
 
     >>> step = (np.arange(800) >= 400)[np.newaxis].astype(np.float32)
-    >>> method = BaselineMethod(16.0, -20.0, lambda n: np.ones(n // 2 + 1, complex), {})
+    >>> method = BaselineMethod(16.0, -20.0, np.ones(1), {})
     >>> tail = method.translate(step)[0, padding(16.0)[0] + 400 :]
     >>> bool(abs(tail[100] / tail[0] - np.exp(-1.6 / 50)) < 1e-6)  # a decay time of 50 us
     True
@@ -69,7 +66,7 @@ class BaselineMethod:
 
     dt_ns: float
     tail_slope_per_ms: float
-    transfer: Callable[[int], Spectrum]
+    transfer: Spectrum
     values: Mapping[str, float]
 
     def translate(self, waveforms: FloatArray) -> FloatArray:
@@ -82,12 +79,11 @@ class BaselineMethod:
             normalised. `finishing.finish` converts them into windows.
         """
         length = record_length(waveforms.shape[1], self.dt_ns)
-        transfer = self.transfer(length)
         remaining = np.exp(self.tail_slope_per_ms * self.dt_ns * 1e-6)
         records = np.empty((len(waveforms), length), np.float32)
         for rows in blocks(len(waveforms)):
-            spectrum = scipy.fft.rfft(currents(waveforms[rows], self.dt_ns), axis=1) * transfer
-            current = scipy.fft.irfft(spectrum, length, axis=1)
+            spectrum = scipy.fft.rfft(currents(waveforms[rows], self.dt_ns), axis=1)
+            current = scipy.fft.irfft(spectrum * self.transfer, length, axis=1)
             records[rows] = scipy.signal.lfilter([1.0], [1.0, -remaining], current, axis=1)
         return records
 
@@ -104,7 +100,7 @@ def currents(windows: FloatArray, dt_ns: float) -> Values:
     return record
 
 
-Kernel = tuple[Callable[[int], Spectrum], dict[str, float]]
+Kernel = tuple[Spectrum, dict[str, float]]
 """Transfer function at the frequencies of a record, and fitted values by name."""
 
 
@@ -166,10 +162,9 @@ def fitted(
     steps = np.cumsum(current, axis=1)
     heights = steps[:, -late_samples:].mean(axis=1, keepdims=True)
     transfer, values = fit(sim[:most], (steps / heights).astype(np.float32), dt_ns)
-    method = BaselineMethod(dt_ns, slope, transfer, values)
+    method, before = BaselineMethod(dt_ns, slope, transfer, values), padding(dt_ns)[0]
     if not late:
         return method
-    before = padding(dt_ns)[0]
     added = slope_of(method.translate(sim[:most])[:, before : before + length]) - slope
     return replace(method, tail_slope_per_ms=slope - added)
 
@@ -188,9 +183,8 @@ def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
         If the data are slower than the maximum tau.
     """
     wanted = most_frequent(current_amplitude(steps, dt_ns))
-    before, longest = padding(dt_ns)[0], LONGEST_NS / dt_ns
-    window = slice(before, before + sim.shape[1])
-    current = currents(sim, dt_ns)
+    before, current = padding(dt_ns)[0], currents(sim, dt_ns)
+    window, longest = slice(before, before + sim.shape[1]), LONGEST_NS / dt_ns
 
     def excess(tau: float) -> float:
         slower = scipy.signal.lfilter([0.0, 1 / tau], [1.0, 1 / tau - 1.0], current)
@@ -201,18 +195,12 @@ def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
         tau_ns = dt_ns  # the data rise faster than the simulation: any integration is worse
     elif excess(longest) > 0:
         raise CpunetError(
-            f"the measured pulses rise slower than an RC of {LONGEST_NS:g} ns makes "
-            "them; check the sampling period and the pulses of both sides"
+            f"measured pulses rise slower than behind {LONGEST_NS:g} ns; check both periods"
         )
     else:
         tau_ns = dt_ns * float(scipy.optimize.brentq(excess, 1.0, longest, xtol=TOLERANCE))
-    return partial(rc, dt_ns, tau_ns), {"tau_ns": tau_ns}
-
-
-def rc(dt_ns: float, tau_ns: float, length: int) -> Spectrum:
-    """Transfer function of the recursion of `fit_rc` at the frequencies of a record."""
-    rate, delay = dt_ns / tau_ns, np.exp(-2j * np.pi * scipy.fft.rfftfreq(length))
-    return np.asarray(rate * delay / (1 + (rate - 1) * delay), complex)
+    rate, delay = dt_ns / tau_ns, np.exp(-2j * np.pi * scipy.fft.rfftfreq(current.shape[1]))
+    return np.asarray(rate * delay / (1 + (rate - 1) * delay)), {"tau_ns": tau_ns}
 
 
 def most_frequent(values: Values) -> float:

@@ -18,18 +18,16 @@ import scipy.fft
 import scipy.ndimage
 import scipy.optimize
 
-from cpunet.electronics.exponentials import FloatArray as Values
-from cpunet.electronics.pile_up_tails import MIN_BASELINES
+from cpunet.electronics.chain import FloatArray as Values
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray, blocks, line_slope
 
+MIN_BASELINES = 30
 MIN_NS = 1600.0  # of a baseline; what is slower follows from the drift over it
 TRACES = 64  # drawn at a time, to bound memory
-FLAT_SIGMAS, CLIPS = (
-    4.0,
-    3,
-)  # robust standard deviations within which traces stay, and number of iterations
+# Robust standard deviations within which traces stay, and number of iterations.
+FLAT_SIGMAS, CLIPS = 4.0, 3
 # Baselines are clustered along directions in which their band powers spread this many times
 # more than those of baselines from a single spectrum.
 KINDS, BANDS, DIFFERENT, OUTLIER = 48, 16, 1.3, 8.0
@@ -157,20 +155,15 @@ class BaselineNoise:
         samples = record_samples(dt_ns)
         mean = cls(np.add(*spectrum(flat, samples)), samples, dt_ns, len(flat))
         which = _kinds(flat, mean)
-        counts = np.bincount(which)
-        spectra = [spectrum(flat[which == kind], samples) for kind in range(len(counts))]
-        kinds, lines = (np.stack(parts) for parts in zip(*spectra, strict=True))
+        spectra = [spectrum(flat[which == kind], samples) for kind in range(which.max() + 1)]
+        kinds, lines = np.swapaxes(spectra, 0, 1)
+        shares = np.bincount(which) / len(flat)
         # standard error of an RMS that is partly extrapolated beyond the baselines
         power = flat.var(axis=1)
         seen = float(np.sqrt(power.mean()))
         chance = float(power.std(ddof=1)) / (2 * seen * len(flat) ** 0.5)
-        return replace(
-            mean,
-            kinds=kinds,
-            lines=lines,
-            shares=counts / counts.sum(),
-            rms_error=float(np.hypot(chance, mean.rms - seen)),
-        )
+        error = float(np.hypot(chance, mean.rms - seen))
+        return replace(mean, kinds=kinds, lines=lines, shares=shares, rms_error=error)
 
     @property
     def rms(self) -> float:
@@ -179,9 +172,7 @@ class BaselineNoise:
         both = 2 * self.density.sum() - self.density[0] - self.density[-1]
         return float(np.sqrt(both / self.samples))
 
-    def draw(
-        self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
-    ) -> FloatArray:
+    def draw(self, energy_kev: Values, length: int, rng: np.random.Generator) -> FloatArray:
         """Draw Gaussian noise for pulses of given energies.
 
         Each long trace of one kind is cut into parts for several pulses, assigned in random
@@ -251,26 +242,26 @@ class BaselineNoise:
 
         The bins are those of a real FFT of `length` samples. A line stays in a single bin.
         """
-        own = self.density[np.newaxis] if self.kinds is None else self.kinds
-        at, frequency = np.arange(length // 2 + 1) / length, np.arange(own.shape[1])
-        continua = np.array([np.interp(at, frequency / self.samples, kind) for kind in own])
-        lines, longer = np.zeros_like(continua), length / self.samples
-        if self.lines is None or self.shares is None or self.kinds is None:
-            return continua, lines, np.ones(1)
-        kind, place = np.nonzero(self.lines)
-        nearest = np.rint(place * longer).astype(int)
-        np.add.at(lines, (kind, nearest), self.lines[kind, place] * longer)
-        return continua, lines, self.shares
+        mean = self.density[np.newaxis]
+        continua, lines, shares = mean, np.zeros_like(mean), np.ones(1)
+        if self.kinds is not None and self.lines is not None and self.shares is not None:
+            continua, lines, shares = self.kinds, self.lines, self.shares
+        at, bins = np.arange(length // 2 + 1) / length, np.arange(len(self.density))
+        continua = np.array([np.interp(at, bins / self.samples, kind) for kind in continua])
+        (kind, place), longer = np.nonzero(lines), length / self.samples
+        moved, nearest = np.zeros_like(continua), np.rint(place * longer).astype(int)
+        np.add.at(moved, (kind, nearest), lines[kind, place] * longer)
+        return continua, moved, shares
 
 
-def require_energies(energy_kev: npt.NDArray[np.float64]) -> None:
+def require_energies(energy_kev: Values, events: npt.NDArray[np.integer] | None = None) -> None:
     """Raise a `CpunetError` unless all energies are positive numbers."""
     usable = np.isfinite(energy_kev) & (energy_kev > 0)
     if not usable.all():
         row = int(np.argmin(usable))
+        name = f"pulse {row}" if events is None else f"event {events[row]}"
         raise CpunetError(
-            f"pulse {row} has an energy of {energy_kev[row]} keV; noise is scaled by "
-            "1/energy, so give the energies"
+            f"{name} has an energy of {energy_kev[row]} keV; give each pulse one above 0"
         )
 
 
@@ -282,10 +273,8 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     """
     import scipy.cluster.vq  # loads half of SciPy: only for those who need kinds
 
-    alike = np.zeros(len(flat), np.intp)
-    kinds = min(KINDS, len(flat) // MIN_BASELINES)
-    bins = flat.shape[1] // 2 + 1 - FIRST_OF_BANDS
-    if kinds < 2 or bins < BANDS:
+    alike, kinds = np.zeros(len(flat), np.intp), min(KINDS, len(flat) // MIN_BASELINES)
+    if kinds < 2 or flat.shape[1] // 2 + 1 < FIRST_OF_BANDS + BANDS:
         return alike
     rng = np.random.default_rng(0)
     own = _band_powers(flat)
@@ -358,10 +347,9 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
     lines = np.zeros(samples // 2 + 1)
     continuum = density.copy()
     bins = np.arange(len(density))
-    local = scipy.ndimage.maximum_filter1d(density, 2 * LINE_HALF_WIDTH + 1) == density
-    for peak in np.flatnonzero(local & (density > LINE_HEIGHT * around)):
-        if not FIRST_CLEAN_BIN < peak < len(density) - LINE_HALF_WIDTH:
-            continue
+    peaks = scipy.ndimage.maximum_filter1d(density, 2 * LINE_HALF_WIDTH + 1) == density
+    peaks &= (bins > FIRST_CLEAN_BIN) & (bins < len(density) - LINE_HALF_WIDTH)
+    for peak in np.flatnonzero(peaks & (density > LINE_HEIGHT * around)):
         near = slice(peak - LINE_HALF_WIDTH, peak + LINE_HALF_WIDTH + 1)
         excess = np.maximum(density[near] - around[near], 0)
         centre = (excess @ bins[near]) / excess.sum() / length
@@ -391,4 +379,4 @@ def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:
     weights = 1 / drift
     rest = (drift - oscillation @ (fast + lines)) * weights
     heights, _ = scipy.optimize.nnls((oscillation @ slow.T) * weights[:, np.newaxis], rest)
-    return np.asarray(fast + heights @ slow, float), lines
+    return np.asarray(fast + heights @ slow), lines

@@ -1,31 +1,121 @@
-"""Description of a readout chain: preamplifier, noise, digitiser and disturbances."""
+"""Description of a readout chain: preamplifier, noise, digitiser and disturbances.
+
+Its linear circuits are sums of exponentials, combined by partial fractions.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
+import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from cpunet.electronics.exponentials import Exponentials, moved_apart
-from cpunet.settings import (
-    Config,
-    Fraction,
-    NonNegative,
-    Positive,
-    Set,
-    read_settings,
-)
+from cpunet.settings import Config, Fraction, NonNegative, Positive, Set, read_settings
+
+ComplexArray = npt.NDArray[np.complex128]
+FloatArray = npt.NDArray[np.float64]
 
 REFERENCE_KEV = 2614.5
 """Energy (keV) of the full-energy peak, at which energy-dependent values are quoted."""
 
-_Share = Annotated[float, Field(gt=0, le=1)]
 MAX_RATE_KHZ = 1000.0  # a pulse per microsecond, far beyond any detector
 MAX_JITTER_NS = 1e6  # longer than records; traces are followed from the start of the pulse
 MAX_SAMPLES = 100_000  # of a record, far beyond any digitiser
-_Rate = Annotated[float, Field(ge=0, le=MAX_RATE_KHZ)]
+# Equal time constants are separated by this relative amount. A sum of single poles then
+# represents a multiple pole: a step response changes by less than 1e-6 of its height, while
+# the residues of even four equal poles keep eight digits.
+_APART = 1e-3
+
+
+@dataclass(frozen=True, eq=False)
+class Exponentials:
+    r"""A transfer function with distinct poles.
+
+    .. math:: H(s) = d + \sum_k \frac{\rho_k}{s - p_k}
+
+    Its step response is a sum of exponentials,
+
+    .. math:: r(t) = d + \sum_k \frac{\rho_k}{p_k} \left(e^{p_k t} - 1\right).
+
+    Parameters
+    ----------
+    direct
+        Instantaneous part :math:`d`, dimensionless.
+    poles, residues
+        Complex arrays :math:`p_k` and :math:`\rho_k` of the same length, in 1/ns.
+
+    Examples
+    --------
+    >>> two = Exponentials.low_pass(40.0) * Exponentials.low_pass(60.0)
+    >>> two.step(np.array([-1.0, 0.0, 1e4])).round(6).tolist()
+    [0.0, 0.0, 1.0]
+
+    One RC integration responds to a step with :math:`1 - e^{-t/\tau}`.
+
+    >>> bool(abs(Exponentials.low_pass(40.0).step(40.0) - (1 - np.exp(-1))) < 1e-15)
+    True
+    """
+
+    direct: float
+    poles: ComplexArray
+    residues: ComplexArray
+
+    @classmethod
+    def of_step(
+        cls, final: float, fractions: Sequence[float], taus_ns: Sequence[float]
+    ) -> Exponentials:
+        r"""Circuit with a step response of :math:`r_\infty + \sum_i f_i e^{-t/\tau_i}`."""
+        poles = -1 / np.array(taus_ns, float)
+        residues = -np.array(fractions, float) / np.array(taus_ns, float)
+        both = (np.asarray(values, np.complex128) for values in (poles, residues))
+        return cls(final + sum(fractions), *both)
+
+    @classmethod
+    def low_pass(cls, tau_ns: float, fraction: float = 1.0) -> Exponentials:
+        r"""RC integration of a `fraction` of the step: :math:`1 - f e^{-t/\tau}`."""
+        return cls.of_step(1.0, [-fraction], [tau_ns])
+
+    def at(self, s: ComplexArray) -> ComplexArray:
+        """Evaluate ``H(s)`` at `s` in 1/ns. `s` must not be a pole."""
+        parts = self.residues / (np.asarray(s, np.complex128)[..., None] - self.poles)
+        return np.asarray(self.direct + parts.sum(axis=-1))
+
+    def __mul__(self, other: Exponentials) -> Exponentials:
+        """Cascade two circuits. They must not share a pole."""
+        residues = self.residues * other.at(self.poles), other.residues * self.at(other.poles)
+        poles = np.concatenate([self.poles, other.poles])
+        return Exponentials(self.direct * other.direct, poles, np.concatenate(residues))
+
+    def step(self, t_ns: npt.ArrayLike) -> FloatArray:
+        """Response to a unit step at 0, at times in ns; zero before it."""
+        t, weights = np.asarray(t_ns, float), self.residues / self.poles
+        modes = np.expm1(np.maximum(t, 0)[..., None] * self.poles) * weights
+        return np.where(t >= 0, self.direct + modes.sum(axis=-1).real, 0.0)
+
+
+def moved_apart(taus_ns: Sequence[float]) -> list[float]:
+    """Separate time constants that agree within 0.1 %, about their mean; keep the order.
+
+    Examples
+    --------
+    >>> [round(tau, 3) for tau in moved_apart([40.0, 500.0, 40.0])]
+    [39.98, 500.0, 40.02]
+    """
+    order = np.argsort(taus_ns, kind="stable")
+    values, start = np.array(taus_ns, float)[order], np.arange(len(order))
+    moved = values.copy()
+    for i in range(len(values)):
+        first = i  # of a group; the more values it has, the farther it reaches
+        while first and moved[first] < (1 + _APART) * moved[first - 1]:
+            first = start[first - 1]
+            steps = np.arange(first, i + 1) - (first + i) / 2
+            moved[first : i + 1] = values[first : i + 1].mean() * (1 + _APART * steps)
+        start[i] = first
+    return [float(tau) for tau in moved[np.argsort(order)]]
 
 
 class SlowPart(Config):
@@ -52,7 +142,7 @@ class Ringing(Config):
 class Decay(Config):
     """A `fraction` of the step that decays with the time constant `tau_us`."""
 
-    fraction: _Share
+    fraction: Annotated[float, Field(gt=0, le=1)]
     tau_us: Positive
 
 
@@ -103,7 +193,7 @@ class Nonlinearity(Config):
 class OtherPulses(Config):
     """Rate of the pulses before a trace, or within its record."""
 
-    rate_kHz: _Rate
+    rate_kHz: Annotated[float, Field(ge=0, le=MAX_RATE_KHZ)]
 
 
 class Electronics(Config):
@@ -178,27 +268,25 @@ class Electronics(Config):
 
     @model_validator(mode="after")
     def _is_possible(self) -> Electronics:
-        total = sum(part.fraction for part in self.decays)
+        total, lines = sum(part.fraction for part in self.decays), self.noise.spectrum.lines
+        nyquist_MHz, fault = 500 / self.dt_ns, ""
         if abs(total - 1) > 1e-6:
-            raise ValueError(f"decays: their fractions add up to {total:g}; they must to 1")
-        if list(self.other_pulses_kev) != sorted(self.other_pulses_kev):
-            raise ValueError("other_pulses_kev: quantiles of energies must not fall")
-        if self.record_ns > MAX_SAMPLES * self.dt_ns:
-            raise ValueError(f"record_ns: more than {MAX_SAMPLES} samples; lower it")
-        if not 0 < self.n_pre < self.length:
-            raise ValueError("before_ns must be at least dt_ns and less than record_ns")
-        if self.baseline_mean_adc >= self.adc_top:
-            raise ValueError(
-                f"baseline_mean_adc must be below {self.adc_top}, the most of adc_bits"
-            )
-        nyquist_MHz, lines = 500 / self.dt_ns, self.noise.spectrum.lines
-        if sum(line.power_fraction for line in lines) >= 1:
-            raise ValueError("noise.lines: their power_fraction must add up to less than 1")
-        if any(line.frequency_MHz >= nyquist_MHz for line in lines):
-            raise ValueError(
-                f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate; leave them "
-                "out or lower dt_ns"
-            )
+            fault = f"decays: their fractions add up to {total:g}; they must to 1"
+        elif list(self.other_pulses_kev) != sorted(self.other_pulses_kev):
+            fault = "other_pulses_kev: quantiles of energies must not fall"
+        elif self.record_ns > MAX_SAMPLES * self.dt_ns:
+            fault = f"record_ns: more than {MAX_SAMPLES} samples; lower it"
+        elif not 0 < self.n_pre < self.length:
+            fault = "before_ns must be at least dt_ns and less than record_ns"
+        elif self.baseline_mean_adc >= self.adc_top:
+            fault = f"baseline_mean_adc must be below {self.adc_top}, the most of adc_bits"
+        elif sum(line.power_fraction for line in lines) >= 1:
+            fault = "noise.lines: their power_fraction must add up to less than 1"
+        elif any(line.frequency_MHz >= nyquist_MHz for line in lines):
+            fault = f"noise.lines: beyond {nyquist_MHz:g} MHz, half the sampling rate; leave "
+            fault += "them out or lower dt_ns"
+        if fault:
+            raise ValueError(fault)
         return self
 
     @property
@@ -235,18 +323,16 @@ class Electronics(Config):
         >>> bool(abs(read_electronics("ornl").transfer.at(0)) < 1e-12)  # no constant current
         True
         """
-        poles, decays = self.bandwidth_poles_ns, self.decays
         # a slow part is missing at first, an overshoot is in excess
-        mixed = [(s.tau_ns, s.fraction) for s in (self.slow,) if s]
-        mixed += [(over.tau_ns, -over.fraction) for over in (self.overshoot,) if over]
-        decays_ns = (1e3 * part.tau_us for part in decays)
-        taus = moved_apart([*poles, *(tau for tau, _ in mixed), *decays_ns])
-        shares = [part.fraction for part in decays]
-        chain = Exponentials.decaying(shares, taus[-len(decays) :])
-        for (_, fraction), tau in zip(mixed, taus[len(poles) :], strict=False):
-            chain = chain * Exponentials.mixed(fraction, tau)
-        for tau in taus[: len(poles)]:
-            chain = chain * Exponentials.low_pass(tau)
+        parts = [(self.slow, 1), (self.overshoot, -1)]
+        stages = [(part.tau_ns, sign * part.fraction) for part, sign in parts if part]
+        stages += [(tau_ns, 1.0) for tau_ns in self.bandwidth_poles_ns]
+        decays_ns = [1e3 * part.tau_us for part in self.decays]
+        taus = moved_apart([*(tau for tau, _ in stages), *decays_ns])
+        n, shares = len(stages), [part.fraction for part in self.decays]
+        chain = Exponentials.of_step(0.0, shares, taus[n:])
+        for (_, fraction), tau in zip(stages, taus, strict=False):
+            chain = chain * Exponentials.low_pass(tau, fraction)
         if ring := self.ringing:
             pole = complex(-1 / ring.damping_ns, 2 * np.pi * ring.frequency_MHz * 1e-3)
             both = np.array([pole, pole.conjugate()])

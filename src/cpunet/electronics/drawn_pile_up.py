@@ -1,4 +1,13 @@
-"""Random pile-up: tails for translated pulses, distributed as in the data, and later pulses.
+r"""Law of pile-up tails, tails for translated pulses as in the data, and later pulses.
+
+Pulses arrive at random with a rate :math:`R` and energies :math:`E` from a spectrum. Each
+decays with a time constant :math:`\tau`. A single pulse leaves more than :math:`x` if it
+arrived at most :math:`\tau \ln(E/x)` ago. Therefore
+
+.. math:: P(>x) = 1 - \exp(-R \tau \langle \max(0, \ln(E/x)) \rangle)
+
+is the fraction of traces with at least one tail above :math:`x`. A tail is described by its
+height at the first sample of a trace, in keV. The only free parameter of the law is the rate.
 
 Tails are drawn from the law of the data. Quality cuts remove traces with large tails. The
 probability of passing the cuts is measured by adding tails to measured traces without any.
@@ -18,16 +27,141 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.exponentials import FloatArray as Values
-from cpunet.electronics.pile_up_tails import PileUpTails
-from cpunet.electronics.tails_law import TailsLaw, earlier_pulses, tail_shape
-from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.preparation import CutWindows, apply_cuts, prepare
-from cpunet.recipes.schema import PreparationConfig
+from cpunet.electronics.chain import FloatArray as Values
+from cpunet.errors import CpunetError
+from cpunet.pulses.container import FloatArray
 
+# After this many decay times the tail is below the noise: 0.02 keV of 2615 keV.
+LIFETIMES = 12.0
+# Maximum expected numbers of pulses before a trace, for memory, and within one.
+MAX_EXPECTED, MAX_PILED = 10_000.0, 4.0
+_MIN_KEV = 1e-3
+_ENERGIES = 64  # energies that represent a spectrum in sums over it
 # Tails in keV at which the probability of passing the cuts is measured.
 SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
-TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which tails are added
+
+Columns = dict[str, tuple[npt.NDArray[Any], str]]
+
+
+@dataclass(frozen=True, eq=False)
+class TailsLaw:
+    """The law of pile-up tails.
+
+    Parameters
+    ----------
+    rate_khz
+        Rate of the pulses in kHz.
+    decay_us
+        Decay time of their tails in us.
+    energies_kev
+        Quantiles of their energies in keV, evenly spaced in probability from the minimum to
+        the maximum. The logarithm is interpolated linearly between them.
+
+    Examples
+    --------
+    >>> law = TailsLaw(1.5, 84.6, (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615))
+    >>> law.share_above([10.0, 50.0]).round(2).tolist()  # of the traces
+    [0.34, 0.2]
+    """
+
+    rate_khz: float
+    decay_us: float
+    energies_kev: tuple[float, ...]
+
+    @property
+    def expected(self) -> float:
+        r"""Expected number of pulses per decay time, :math:`R \tau`."""
+        return self.rate_khz * 1e-3 * self.decay_us
+
+    def share_above(self, kev: npt.ArrayLike) -> Values:
+        r"""Fraction of traces on which a single earlier pulse leaves more than `kev`.
+
+        .. math:: P(>x) = 1 - \exp(-R \tau \langle \max(0, \ln(E/x)) \rangle)
+
+        Examples
+        --------
+        With a single energy, :math:`x = E/e` lies one decay time back.
+
+        >>> law = TailsLaw(1.0, 100.0, (300.0, 300.0))
+        >>> bool(abs(law.share_above(300.0 / np.e) - (1 - np.exp(-0.1))) < 1e-12)
+        True
+        """
+        # of equally probable energies that represent the spectrum
+        energies = energies_at((np.arange(_ENERGIES) + 0.5) / _ENERGIES, self.energies_kev)
+        ratio = energies / np.asarray(kev, float)[..., np.newaxis]
+        lives = np.log(np.maximum(ratio, 1)).mean(axis=-1)
+        return np.asarray(-np.expm1(-self.expected * lives), float)
+
+    def draw(self, n: int, rng: np.random.Generator) -> Values:
+        """Draw the tail in keV, summed over all earlier pulses, for `n` traces."""
+        row, kev, before_us = earlier_pulses(
+            n, self.rate_khz, LIFETIMES * self.decay_us, self.energies_kev, rng
+        )
+        left = kev * np.exp(-before_us / self.decay_us)
+        return np.asarray(np.bincount(row, left, minlength=n), float)
+
+
+def tail_shape(length: int, dt_ns: float, decay_us: float, lead_us: float = 0.0) -> Values:
+    """Decay of a tail that is 1 a time `lead_us` before the first sample, ``(length,)``."""
+    time_us = np.arange(length) * dt_ns * 1e-3 + lead_us
+    return np.asarray(np.exp(-time_us / decay_us), float)
+
+
+def earlier_pulses(
+    n: int,
+    rate_khz: float,
+    longest_us: float,
+    energies_kev: Sequence[float],
+    rng: np.random.Generator,
+    *,
+    most: float = MAX_EXPECTED,
+) -> tuple[npt.NDArray[np.intp], Values, Values]:
+    """Draw pulses of a Poisson process within a time interval, for each of `n` traces.
+
+    Parameters
+    ----------
+    n
+        Number of traces.
+    rate_khz, longest_us
+        Rate in kHz and length of the interval in us.
+    energies_kev
+        Quantiles of the energies in keV, see `TailsLaw`.
+    rng
+        Random generator.
+    most
+        Largest number that may be expected for a trace.
+
+    Returns
+    -------
+    tuple
+        Index of the trace, energy in keV and time in us (0 to `longest_us`) of each pulse,
+        all of shape ``(pulses,)``.
+
+    Raises
+    ------
+    CpunetError
+        If more pulses are expected for a trace.
+    """
+    expected = rate_khz * 1e-3 * longest_us
+    if expected > most:
+        raise CpunetError(
+            f"other pulses at {rate_khz:g} kHz: {expected:.3g} in {longest_us:.3g} us, more "
+            f"than {most:g}; give a lower rate, or a shorter decay or record"
+        )
+    counts = rng.poisson(expected, size=n)
+    row = np.repeat(np.arange(n), counts)
+    kev = energies_at(rng.random(len(row)), energies_kev)
+    return row, kev, rng.uniform(0, longest_us, size=len(row))
+
+
+def energies_at(share: Values, energies_kev: Sequence[float]) -> Values:
+    """Energies in keV below which a fraction `share` of a spectrum lies.
+
+    The spectrum is given by its quantiles, see `TailsLaw`.
+    """
+    logs = np.log(np.maximum(np.asarray(energies_kev, float), _MIN_KEV))
+    at = np.linspace(0, 1, len(logs))
+    return np.asarray(np.exp(np.interp(share, at, logs)), float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,11 +194,8 @@ class DrawnTails(TailsLaw):
             return kev
         again = np.arange(n)
         for _ in range(100):  # most traces have no tail and pass
-            sizes = np.log1p(kev[again])
-            passes = np.interp(sizes, np.log1p(SIZES_KEV), self.passed)
+            passes = np.interp(np.log1p(kev[again]), np.log1p(SIZES_KEV), self.passed)
             again = again[rng.random(len(again)) >= passes]
-            if not len(again):
-                break
             kev[again] = self.draw(len(again), rng)
         return kev
 
@@ -73,9 +204,7 @@ class DrawnTails(TailsLaw):
         lead_us = self.lead_us if lead_us is None else lead_us
         return tail_shape(length, self.dt_ns, self.decay_us, lead_us)
 
-    def factors(
-        self, energy_kev: npt.NDArray[np.float64], rng: np.random.Generator
-    ) -> FloatArray:
+    def factors(self, energy_kev: Values, rng: np.random.Generator) -> FloatArray:
         """Draw tails for pulses of given energies, in prepared units."""
         kev = self.draw_kev(len(energy_kev), rng)
         return np.asarray(kev * self.height / energy_kev, np.float32)
@@ -101,51 +230,13 @@ class TraceNoise:
         """Sampling period of the noise in ns."""
         return self.noise.dt_ns
 
-    def draw(
-        self, energy_kev: npt.NDArray[np.float64], length: int, rng: np.random.Generator
-    ) -> FloatArray:
+    def draw(self, energy_kev: Values, length: int, rng: np.random.Generator) -> FloatArray:
         """Draw noise as `BaselineNoise.draw`, with pile-up tails added."""
         drawn = self.noise.draw(energy_kev, length, rng)
         if self.tails is not None:
             factors = self.tails.factors(energy_kev, rng)
             drawn += factors[:, np.newaxis] * self.tails.decay(length).astype(np.float32)
         return drawn
-
-
-def passing(
-    tails: PileUpTails, traces: Pulses, config: PreparationConfig, cuts: CutWindows
-) -> tuple[float, ...] | None:
-    """Probability that traces with tails of `SIZES_KEV` pass the quality cuts.
-
-    Parameters
-    ----------
-    tails
-        Tails of the channel.
-    traces
-        Raw traces that have passed the cuts.
-    config, cuts
-        Preparation settings and quality cuts.
-
-    Returns
-    -------
-    tuple of float
-        One probability per size, or None if too few traces have no tail.
-    """
-    raw = traces.waveforms[tails.measure(traces) < tails.fit.sigma_kev][:TEMPLATES]
-    if len(raw) < MIN_TEMPLATES:
-        return None
-    shape = tail_shape(raw.shape[1], tails.dt_ns, tails.decay_us)
-    unit = (tails.adc_per_kev * shape).astype(np.float32)
-    shares = []
-    for kev in SIZES_KEV:
-        lifted = Pulses.of(raw + np.float32(kev) * unit, dt_ns=tails.dt_ns)
-        shares.append(len(apply_cuts(prepare(lifted, config, "measured"), cuts)) / len(raw))
-    return tuple(share / max(shares[0], 1e-9) for share in np.minimum.accumulate(shares))
-
-
-MAX_EXPECTED = 4.0  # maximum expected number of piled-up pulses per trace
-
-Columns = dict[str, tuple[npt.NDArray[Any], str]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -191,8 +282,7 @@ class InTracePileUp:
         n
             Number of traces.
         rate_khz, energies_kev
-            Rate in kHz, and quantiles of the energies, see
-            `cpunet.electronics.tails_law.TailsLaw`.
+            Rate in kHz, and quantiles of the energies, see `TailsLaw`.
         dt_ns
             Sampling period in ns.
         before, length
@@ -203,7 +293,7 @@ class InTracePileUp:
         Raises
         ------
         CpunetError
-            If more than `MAX_EXPECTED` pulses are expected in a record.
+            If more than `MAX_PILED` pulses are expected in a record.
 
         Examples
         --------
@@ -216,23 +306,18 @@ class InTracePileUp:
         """
         record_us = 1e-3 * (length * dt_ns)
         row, kev, time_us = earlier_pulses(
-            n, rate_khz, record_us, energies_kev, rng, most=MAX_EXPECTED
+            n, rate_khz, record_us, energies_kev, rng, most=MAX_PILED
         )
         partner = rng.integers(max(n, 1), size=len(row))
         return cls(n, row, kev, 1e3 * time_us - before * dt_ns, partner)
 
     def of_rows(self, rows: npt.NDArray[np.integer]) -> Self:
         """Piled-up pulses of selected traces, with the traces renumbered."""
-        place = np.full(self.n, -1)
-        place[rows] = np.arange(len(rows))
+        place, n = np.full(self.n, -1), len(rows)
+        place[rows] = np.arange(n)
         inside = place[self.row] >= 0
-        return type(self)(
-            len(rows),
-            place[self.row[inside]],
-            self.kev[inside],
-            self.after_ns[inside],
-            self.partner[inside] % max(len(rows), 1),
-        )
+        row, partner = place[self.row[inside]], self.partner[inside] % max(n, 1)
+        return type(self)(n, row, self.kev[inside], self.after_ns[inside], partner)
 
     def columns(self) -> Columns:
         """What is in each trace, as columns of a table with their units.
@@ -256,11 +341,7 @@ class InTracePileUp:
         return int(np.ceil(-min(earliest, 0.0) / dt_ns)) + 1
 
     def added(
-        self,
-        shapes: npt.NDArray[np.floating],
-        energy_kev: Values,
-        dt_ns: float,
-        length: int,
+        self, shapes: npt.NDArray[np.floating], energy_kev: Values, dt_ns: float, length: int
     ) -> Values:
         """Sum of the piled-up pulses at each sample, relative to the trace's own pulse.
 
@@ -291,15 +372,10 @@ class InTracePileUp:
         >>> piled.added(step, np.array([100.0]), 16.0, 5).tolist()
         [[0.0, 0.0, 0.25, 0.5, 0.5]]
         """
-        total = np.zeros((self.n, length))
-        shift = self.after_ns / dt_ns
-        whole = np.floor(shift).astype(int)
-        for i, row in enumerate(self.row):
-            late = shift[i] - whole[i]
-            shape = (1 - late) * shapes[i, 1:] + late * shapes[i, :-1]
-            # sample k of the record is sample k - whole of the shape without its first
-            start = whole[i] + 1
-            part = shape[max(0, -start) : max(0, length - start)]
-            first = max(0, start)
-            total[row, first : first + len(part)] += self.kev[i] / energy_kev[row] * part
+        total, time, own = np.zeros((self.n, length)), np.arange(length), len(shapes.T)
+        for row, kev, late, shape in zip(
+            self.row, self.kev, self.after_ns / dt_ns, shapes, strict=True
+        ):
+            moved = np.interp(time - late, np.arange(own), shape, left=0.0)
+            total[row] += kev / energy_kev[row] * moved
         return total

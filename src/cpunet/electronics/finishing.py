@@ -84,7 +84,6 @@ def with_room(
     return extended(windows, config, dt_ns, length, before)
 
 
-RecordNoise = BaselineNoise | TraceNoise
 # records in units of the charge, energies, and noise as in baselines
 ByHeight = Callable[[npt.NDArray[Any], npt.NDArray[np.float64], Any], npt.NDArray[Any]]
 
@@ -115,7 +114,7 @@ def finish(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: RecordNoise | None = None,
+    noise: BaselineNoise | TraceNoise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
     added: npt.NDArray[np.float64] | None = None,
@@ -162,6 +161,7 @@ def finish(
     # A noise-free record may have equal samples at its top; none of them is clipped.
     config = config.at(dt_ns).model_copy(update={"saturation_run": records.shape[1] + 1})
     rng, n = np.random.default_rng(seed), len(records)
+    kev = np.full(n, np.nan) if energy_kev is None else energy_kev
     windows = np.full((n, config.length), np.nan, np.float32)
     noisy = windows if noise is None else windows.copy()
     codes, begin = np.zeros(n, np.uint8), np.zeros(n, np.int64)
@@ -177,20 +177,17 @@ def finish(
     for rows in blocks(n):
         block = records[rows]
         if by_height is not None:
-            assert energy_kev is not None  # what a height is
-            block = by_height(block, energy_kev[rows], 0.0)
+            block = by_height(block, kev[rows], 0.0)
         clean = prepared(block, np.arange(n)[rows], windows)
         if noise is not None:
-            assert energy_kev is not None  # noise scales as 1/energy
             places = np.arange(n)[rows][clean.index]
             height = clean.scale[:, np.newaxis]
             level = (block[clean.index] - clean.baseline[:, np.newaxis]) / height
-            drawn = noise.draw(energy_kev[places], block.shape[1], rng)
+            drawn = noise.draw(kev[places], block.shape[1], rng)
             if added is not None:
                 drawn += added[places]
-            if by_height is None:
-                raw = level + drawn
-            else:
-                raw = by_height(records[places], energy_kev[places], drawn * height)
+            raw = level + drawn
+            if by_height is not None:
+                raw = by_height(records[places], kev[places], drawn * height)
             prepared(np.asarray(raw, np.float32), places, noisy)
     return Finished(noisy, codes, windows, begin)

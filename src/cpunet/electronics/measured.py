@@ -8,12 +8,14 @@ from dataclasses import asdict
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails, TraceNoise, passing
+from cpunet.electronics.drawn_pile_up import SIZES_KEV, DrawnTails, TraceNoise, tail_shape
 from cpunet.electronics.finishing import padding
 from cpunet.electronics.pile_up_tails import PileUpTails, TailsInfo
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InputSet
+from cpunet.pulses.preparation import CutWindows, apply_cuts, prepare
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.settings import plain
 
@@ -21,6 +23,7 @@ log = logging.getLogger(__name__)
 
 NOISE_TRACES = 4096  # number of traces whose baselines determine the noise
 MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
+TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which tails are added
 
 
 def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, TailsInfo]:
@@ -49,16 +52,14 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
         log.info(f"pile-up tails are not measured: {reason}")
         return TraceNoise(noise_of(data)), TailsInfo(missing=reason)
     # tails to draw like those of the data behind their quality cuts
-    law, baselines, dt_ns, passed = pile_up.law, _baselines(data), data.dt_ns, None
-    if data.cuts is not None and baselines.whole is not None and law is not None:
-        passed = passing(pile_up, baselines.whole, config, data.cuts)
+    law, whole, dt_ns, passed = pile_up.law, _baselines(data).whole, data.dt_ns, None
+    if data.cuts is not None and whole is not None and law is not None:
+        passed = passing(pile_up, whole, config, data.cuts)
     before = config.at(dt_ns).samples_before + padding(dt_ns)[0]
-    begins = float(np.median(data.prepared.align_sample)) - before
+    lead_us = (float(np.median(data.prepared.align_sample)) - before) * dt_ns * 1e-3
     height = float(np.median(data.prepared.pulses.waveforms.max(axis=1)))
-    own = asdict(pile_up.fit.law)
-    drawn = DrawnTails(
-        **own, height=height, lead_us=begins * dt_ns * 1e-3, dt_ns=dt_ns, passed=passed
-    )
+    of_windows = {"height": height, "lead_us": lead_us, "dt_ns": dt_ns, "passed": passed}
+    drawn = DrawnTails(**asdict(pile_up.fit.law) | of_windows)
     info = pile_up.describe().model_copy(update={"drawn": plain(asdict(drawn))})
     if law is None:
         return TraceNoise(noise_of(data, pile_up)), info
@@ -72,6 +73,36 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
     return TraceNoise(noise_of(data, pile_up), drawn), info
 
 
+def passing(
+    tails: PileUpTails, traces: Pulses, config: PreparationConfig, cuts: CutWindows
+) -> tuple[float, ...] | None:
+    """Probability that traces with tails of `SIZES_KEV` pass the quality cuts.
+
+    Parameters
+    ----------
+    tails
+        Tails of the channel.
+    traces
+        Raw traces that have passed the cuts.
+    config, cuts
+        Preparation settings and quality cuts.
+
+    Returns
+    -------
+    tuple of float
+        One probability per size, or None if too few traces have no tail.
+    """
+    raw = traces.waveforms[tails.measure(traces) < tails.fit.sigma_kev][:TEMPLATES]
+    if len(raw) < MIN_TEMPLATES:
+        return None
+    shape = tail_shape(raw.shape[1], tails.dt_ns, tails.decay_us)
+    unit, shares = (tails.adc_per_kev * shape).astype(np.float32), []
+    for kev in SIZES_KEV:
+        lifted = Pulses.of(raw + np.float32(kev) * unit, dt_ns=tails.dt_ns)
+        shares.append(len(apply_cuts(prepare(lifted, config, "measured"), cuts)) / len(raw))
+    return tuple(share / max(shares[0], 1e-9) for share in np.minimum.accumulate(shares))
+
+
 def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
     """Pile-up tails of the data and None, or None and why they cannot be estimated."""
     try:
@@ -83,15 +114,15 @@ def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
 def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
     """Measure the noise from the raw samples before the pulses.
 
-    If traces have pile-up tails, only those at the level of empty baselines are
-    used.
+    If traces have pile-up tails, only those at the level of empty baselines are used.
 
     Raises
     ------
     CpunetError
         If the baselines are too few or too short.
     """
-    first = (baselines := _baselines(data)).first
+    baselines = _baselines(data)
+    first = baselines.first
     usable = np.isfinite(first.energy_kev) & (first.energy_kev > 0)
     usable[NOISE_TRACES:] = False
     if tails is not None and tails.law is not None:

@@ -1,4 +1,4 @@
-r"""Pile-up tails under raw traces, from the level and slope of their baselines.
+r"""Pile-up tails under raw traces, from the level and slope of their baselines, and their rate.
 
 A tail of height :math:`A` above the level of an empty baseline follows
 :math:`A e^{-t/\tau}`. It raises the baseline and tilts it. With a DC-coupled amplifier the
@@ -6,27 +6,44 @@ A tail of height :math:`A` above the level of an empty baseline follows
 are weighted by their errors. These come from the lower side of each distribution, which the
 tails do not affect. Large tails also give the decay time: the means of the two halves of
 their baselines, after a time :math:`h`, have a ratio of :math:`e^{h/\tau}`.
+
+The sum of all tails is shot noise (Campbell 1909). The logarithm of its characteristic function
+is, for the law of `cpunet.electronics.drawn_pile_up`,
+
+.. math:: \ln \varphi(u) = R \tau \left\langle \int_0^E \frac{e^{iux} - 1}{x} dx \right\rangle
+    = R \tau \left\langle i\,\mathrm{Si}(uE) - \mathrm{Cin}(uE) \right\rangle .
+
+In the likelihood fit of the rate each trace contributes one measured tail with an error,
+relative to the level of an empty baseline. The density of the law, convolved with the error,
+is known. Rate, level and error are therefore fitted together. Real noise is not Gaussian: its
+wings would be mistaken for small tails. They are determined from the side below 0, which tails
+do not affect.
+
+The energies are those of the file. Where these cannot describe the rate (for example, in a file
+with a few gamma lines only), they follow a log-normal spectrum up to the maximum energy, which
+is fitted to the tails.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+from iminuit import Minuit
 from pydantic import Field
 from scipy.stats import median_abs_deviation
 
-from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.tails_law import RateFit, TailsLaw, fit_rate, tail_shape
+from cpunet.electronics.baseline_noise import MIN_BASELINES
+from cpunet.electronics.chain import ComplexArray, FloatArray
+from cpunet.electronics.drawn_pile_up import TailsLaw, tail_shape
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InfoPart
 
-MIN_BASELINES = 30  # minimum number of baselines
-SIGMA_PER_MAD = 1.4826  # of a normal distribution
 MIN_LARGE = 20  # minimum number of large tails to determine coupling and decay time
 # A baseline whose level differs by more than this factor from what its tilt implies is not
 # that of a tail.
@@ -45,6 +62,27 @@ SURE, SURE_GAIN = 4.0, 12.0
 # Maximum fraction of traces with a tail larger than the error, at a significant rate or not.
 MAX_FULL, MAX_UNSURE = 0.97, 0.5
 SHARES_KEV = (10.0, 30.0, 100.0, 300.0)  # thresholds at which fractions are reported
+# Range and number of energies of a spectrum; the lowest still leaves a visible tail.
+LOWEST_KEV, HIGHEST_KEV, NODES = 5.0, 2700.0, 48
+QUANTILES = 41  # quantiles of the returned spectrum
+# Points of the density. It is periodic, so the grid must hold all energies, also in steps of
+# small errors: down to 0.15 keV.
+LEAST_GRID, MOST_GRID = 1024, 131_072
+STEPS_OF_SIGMA = 4.0
+NEGLIGIBLE = 8.8  # standard deviations in u: exp(-8.8²/2) is 1.5e-17
+ROOM = 10.0  # standard deviations of room on either side
+OUTLIERS = 2e-3  # fraction of traces that the law need not explain
+# Required log-likelihood gain of a fitted spectrum, which has two additional parameters.
+WORTH = 5.0
+# Maximum fraction of the noise in its wings, and minimum number of traces to determine them.
+MAX_WINGS, MIN_BELOW = 0.5, 100
+# Mean and width of the priors on the logarithms of the median energy and of the spectral width.
+MEDIAN, WIDTH = (np.log(240.0), 1.0), (0.0, 0.4)
+STARTS = 0.005, 0.1  # pulses per decay time at which fits begin
+# Limits of logarithms: of this number, of the error over its estimate (below, the grid is too
+# coarse), of the spectrum, and of the wings.
+EXPECTED, SIGMA, SPECTRUM = (-20.0, 6.0), (-1.0, 8.0), ((0.0, 10.0), (-2.0, 2.0))
+WINGS = -5.0, 5.0
 
 
 def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
@@ -57,33 +95,23 @@ def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
         or the pulses do not decay.
     """
     prepared, length = baselines.prepared, baselines.length
-    if len(prepared) < MIN_BASELINES:
-        reasons = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
-        raise CpunetError(
-            f"only {len(prepared)} of {len(baselines)} traces can be prepared "
-            f"({reasons or 'there are no more'}); {MIN_BASELINES} or more are needed to tell "
-            "pile-up tails"
-        )
-    if length < MIN_SAMPLES:
-        raise CpunetError(
-            f"the traces have {length} samples before the pulse; pile-up tails "
-            f"need {MIN_SAMPLES} or more, so give traces with a longer baseline"
-        )
     with np.errstate(divide="ignore"):  # an energy of 0 is left out
         gains = baselines.height / prepared.pulses.energy_kev
     gains = gains[np.isfinite(gains) & (gains > 0)]
     if len(gains) < MIN_BASELINES:
+        reasons = "".join(f", {n} {reason}" for reason, n in prepared.rejections.items())
         raise CpunetError(
-            f"only {len(gains)} traces have a known energy and can be prepared; "
-            f"{MIN_BASELINES} or more are needed to tell pile-up tails in keV"
+            f"only {len(gains)} of {len(baselines)} traces can be prepared and have a known "
+            f"energy{reasons}; {MIN_BASELINES} or more are needed to tell pile-up tails"
+        )
+    if length < MIN_SAMPLES:
+        raise CpunetError(
+            f"{length} samples before pulses are too few for tails; give {MIN_SAMPLES} or more"
         )
     large = prepared.scale >= np.median(prepared.scale)
     slope = float(np.median(prepared.tail_slope[large]))
     if not slope < 0:
-        raise CpunetError(
-            "the tails of the traces do not decay, so earlier pulses leave no trace; "
-            "are these measured traces?"
-        )
+        raise CpunetError("the tails of the traces do not decay; are these measured traces?")
     values = baselines.first.waveforms[:, :length].astype(float)
     return values, float(np.median(gains)), -1e3 / slope
 
@@ -129,6 +157,23 @@ def read_baselines(
     return mean, left, np.where(np.isfinite(width), width, np.inf)
 
 
+def tails_kev(
+    values: FloatArray, dt_ns: float, decay_us: float, level_adc: float, adc_per_kev: float
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Tails by slope and by level in keV, and residual RMS, see `read_baselines`."""
+    mean, left, width = read_baselines(values, dt_ns, decay_us)
+    per_kev = tail_shape(values.shape[1], dt_ns, decay_us).mean() * adc_per_kev
+    return left / adc_per_kev, (mean - level_adc) / per_kev, width
+
+
+def widest_of(width: FloatArray) -> float:
+    """Largest residual RMS of a baseline without another pulse, from those of many."""
+    finite = width[np.isfinite(width)]  # those of all traces that can be prepared
+    centre = float(np.median(finite))
+    sigma = float(median_abs_deviation(finite, scale="normal"))
+    return centre + max(DISTURBED * sigma, 0.1 * centre)
+
+
 def mode(values: FloatArray) -> float:
     """Mode of a one-sided distribution, by repeatedly halving the shortest half."""
     ordered = np.sort(values)
@@ -144,7 +189,31 @@ def mode(values: FloatArray) -> float:
 def lower_spread(values: FloatArray) -> float:
     """Standard deviation of the side below 0, which tails do not affect."""
     below = -values[values <= 0]
-    return max(float(SIGMA_PER_MAD * np.median(below)) if len(below) else 0.0, 1e-9)
+    return max(1.4826 * float(np.median(below)) if len(below) else 0.0, 1e-9)
+
+
+@dataclass(frozen=True, eq=False)
+class RateFit:
+    """Result of a fit of the law to a set of tails.
+
+    Parameters
+    ----------
+    law, rate_error_khz
+        The law, and the standard error of its rate in kHz.
+    level_kev, sigma_kev
+        Level of an empty baseline and spread of traces about it, in keV.
+    recorded
+        Whether the law uses the energies of the file rather than a fitted spectrum.
+    gain_of_law
+        Log-likelihood relative to that without any tails.
+    """
+
+    law: TailsLaw
+    rate_error_khz: float
+    level_kev: float
+    sigma_kev: float
+    recorded: bool
+    gain_of_law: float
 
 
 class TailsInfo(InfoPart):
@@ -248,16 +317,16 @@ class PileUpTails:
         return self.fit.law if sure and self.fit.gain_of_law > SURE_GAIN else None
 
     @classmethod
-    def of(cls, baselines: Baselines, decay_us: float | None = None) -> PileUpTails:
+    def of(cls, baselines: Baselines) -> PileUpTails:
         """Measure the tails under raw traces and fit their law.
+
+        Their decay time is taken from large tails or, if there are none or levels do not follow
+        them, from the tails of the pulses.
 
         Parameters
         ----------
         baselines
             Baselines of measured traces of one channel, from any mixture of peaks.
-        decay_us
-            Decay time of the preamplifier in us, if given. Otherwise it is taken from large
-            tails or, if there are none, from the tails of the pulses.
 
         Raises
         ------
@@ -265,17 +334,17 @@ class PileUpTails:
             If the baselines are too short, the energies are unknown, or too few traces can
             be used.
         """
-        values, gain, tail_decay = usable(baselines)
-        dt_ns, samples = baselines.first.dt_ns, values.shape[1]
-        decay, error = decay_us or tail_decay, None
-        mean, left, quiet, widest = _read(values, dt_ns, decay)
+        values, gain, decay = usable(baselines)
+        dt_ns, samples, error = baselines.first.dt_ns, values.shape[1], None
+        mean, left, width = read_baselines(values, dt_ns, decay)
+        quiet = width <= widest_of(width)
         level = mode(mean[quiet])
         tilted = quiet & (left > LARGE * lower_spread(left[quiet]))
         large, coupled = values[tilted] - level, False
         if len(large) >= MIN_LARGE:  # with DC coupling they are as high as their tilt implies
             high = large[:, : samples // 4].mean(axis=1) / left[tilted]
             coupled = 1 / COUPLED < float(np.median(high)) < COUPLED
-        if coupled and decay_us is None:  # by their means over both halves
+        if coupled:  # by their means over both halves
             half = samples // 2
             first, second = large[:, :half].mean(axis=1), large[:, half : 2 * half].mean(axis=1)
             positive = (first > 0) & (second > 0)
@@ -284,10 +353,9 @@ class PileUpTails:
                 decay = half * dt_ns * 1e-3 / middle
                 spread = 1.2533 * float(median_abs_deviation(fall, scale="normal"))
                 error = decay * spread / middle / float(np.sqrt(len(fall)))
-                mean, left, quiet, widest = _read(values, dt_ns, decay)
         # tails by slope and by level, weighted by their errors
-        of_slope = left / gain
-        of_level = (mean - level) / (tail_shape(samples, dt_ns, decay).mean() * gain)
+        of_slope, of_level, width = tails_kev(values, dt_ns, decay, level, gain)
+        quiet = width <= (widest := widest_of(width))
         slope_error = lower_spread(of_slope[quiet])
         level_error = lower_spread(of_level[quiet]) if coupled else np.inf
         weight = slope_error**2 / (slope_error**2 + level_error**2) if coupled else 0.0
@@ -319,10 +387,9 @@ class PileUpTails:
         :math:`A_0` of empty baselines.
         """
         baselines = np.asarray(raw.waveforms[:, : self.samples], float)
-        mean, left, width = read_baselines(baselines, self.dt_ns, self.decay_us)
-        shape = tail_shape(self.samples, self.dt_ns, self.decay_us).mean()
-        of_level, weight = (mean - self.level_adc) / shape, self.level_weight
-        kev = ((1 - weight) * left + weight * of_level) / self.adc_per_kev
+        units = self.level_adc, self.adc_per_kev
+        of_slope, of_level, width = tails_kev(baselines, self.dt_ns, self.decay_us, *units)
+        kev = (1 - self.level_weight) * of_slope + self.level_weight * of_level
         return np.where(width <= self.widest_adc, kev - self.fit.level_kev, np.nan)
 
     def describe(self) -> TailsInfo:
@@ -349,13 +416,181 @@ class PileUpTails:
         )
 
 
-def _read(
-    values: FloatArray, dt_ns: float, decay_us: float
-) -> tuple[FloatArray, FloatArray, npt.NDArray[np.bool_], float]:
-    """Mean of each baseline, tail, whether it holds no other pulse, and largest RMS."""
-    mean, left, width = read_baselines(values, dt_ns, decay_us)
-    finite = width[np.isfinite(width)]  # those of all traces that can be prepared
-    centre = float(np.median(finite))
-    sigma = float(median_abs_deviation(finite, scale="normal"))
-    widest = centre + max(DISTURBED * sigma, 0.1 * centre)
-    return mean, left, width <= widest, widest
+def characteristic_exponents(u: FloatArray, energies_kev: FloatArray) -> ComplexArray:
+    r"""Logarithm of the characteristic function per expected pulse.
+
+    .. math:: \int_0^E \frac{e^{iux} - 1}{x} dx = i\,\mathrm{Si}(uE) - \mathrm{Cin}(uE)
+
+    Parameters
+    ----------
+    u
+        Arguments in 1/keV.
+    energies_kev
+        Pulse energies in keV.
+
+    Returns
+    -------
+    array
+        Complex, shape ``(len(u), len(energies_kev))``.
+
+    Examples
+    --------
+    To first order it is :math:`iuE`.
+
+    >>> characteristic_exponents(np.array([1e-5]), np.array([100.0])).imag.round(6).tolist()
+    [[0.001]]
+    """
+    import scipy.special  # a fifth of a second, for those who look for tails only
+
+    phase = np.maximum(u[:, np.newaxis] * energies_kev, 1e-12)
+    sine, cosine = scipy.special.sici(phase)
+    return np.asarray(1j * sine - (np.euler_gamma + np.log(phase) - cosine))
+
+
+def fit_rate(
+    kev: FloatArray, sigma_kev: float, decay_us: float, energies_kev: FloatArray
+) -> RateFit:
+    r"""Fit rate, level and error to measured tails.
+
+    The log-likelihood of the tails :math:`x_i` is
+
+    .. math:: \ln L = \sum_i \ln\left[(1 - \epsilon)\, p(x_i) + \epsilon u\right],
+
+    where :math:`p` is the density of the law convolved with the noise and :math:`u` a uniform
+    density for a small fraction :math:`\epsilon` of outliers. With the characteristic function
+    :math:`\varphi` of the law, and except for the wings of the noise,
+
+    .. math:: p(x) = \frac{1}{2\pi} \int \varphi(u)\, e^{-\sigma^2 u^2 / 2}\, e^{-iux} du .
+
+    Parameters
+    ----------
+    kev
+        Measured tails in keV, near 0 for empty baselines.
+    sigma_kev
+        Initial estimate of their standard deviation in keV.
+    decay_us
+        Decay time of the tails in us.
+    energies_kev
+        Energies of the pulses of the file in keV.
+    """
+    finite = energies_kev[np.isfinite(energies_kev) & (energies_kev > LOWEST_KEV)]
+    highest = float(np.clip(finite.max(initial=0.0), 100.0, HIGHEST_KEV))
+    energies = np.geomspace(LOWEST_KEV, highest, NODES)
+    likelihood, logs = _likelihood(kev, sigma_kev, energies), np.log(energies)
+    edges = np.concatenate([[-np.inf], 0.5 * (logs[1:] + logs[:-1]), [np.inf]])
+    own = np.histogram(np.log(finite), edges)[0] / max(len(finite), 1)
+
+    def weights(shape: FloatArray) -> FloatArray:
+        """Those of the file, or of a log-normal spectrum."""
+        if not len(shape):
+            return own
+        parts = np.exp(-0.5 * ((logs - shape[0]) / np.exp(shape[1])) ** 2)
+        return np.asarray(parts / parts.sum(), float)
+
+    def cost(values: FloatArray) -> float:
+        (expected, level, sigma), shape = values[:3], values[3:]
+        priors = zip(shape, (MEDIAN, WIDTH), strict=False)
+        prior = sum(0.5 * ((value - mean) / width) ** 2 for value, (mean, width) in priors)
+        return float(prior - likelihood(np.exp(expected), level, np.exp(sigma), weights(shape)))
+
+    own_sigma = float(np.log(sigma_kev))
+    starts = [[np.log(n), 0.0, own_sigma] for n in STARTS]
+    limits = [EXPECTED, None, (own_sigma + SIGMA[0], own_sigma + SIGMA[1])]
+    fit = _best(cost, [[*s, MEDIAN[0], WIDTH[0]] for s in starts], [*limits, *SPECTRUM])
+    if len(finite):
+        of_file = _best(cost, starts, limits)
+        fit = of_file if of_file.fval <= fit.fval + WORTH else fit
+    fit.hesse()
+    values = np.array(fit.values)
+    khz = 1e3 * float(np.exp(values[0])) / decay_us
+    spread = np.log([sigma_kev, max(float(kev.std()), sigma_kev)])
+    alone = [values[1:3].tolist(), *([float(np.median(kev)), sigma] for sigma in spread)]
+    # no pulses at all have a number whose logarithm is minus infinity
+    without = _best(lambda v: cost(np.array([-np.inf, *v])), alone, limits[1:])
+    # quantiles of the spectrum, evenly spaced in probability
+    edges[[0, -1]] = logs[[0, -1]]
+    spectrum = weights(values[3:])
+    share = np.concatenate([[0.0], np.cumsum(spectrum)]) / spectrum.sum()
+    quantiles = np.exp(np.interp(np.linspace(0, 1, QUANTILES), share, edges))
+    return RateFit(
+        law=TailsLaw(khz, decay_us, tuple(quantiles.tolist())),
+        rate_error_khz=khz * fit.errors[0],
+        level_kev=float(values[1]),
+        sigma_kev=float(np.exp(values[2])),
+        recorded=len(values) == len(limits),
+        gain_of_law=without.fval - fit.fval,
+    )
+
+
+def _likelihood(
+    kev: FloatArray, sigma_kev: float, energies: FloatArray
+) -> Callable[[float, float, float, FloatArray], float]:
+    """Log-likelihood of the tails as a function of number, level, error and spectrum."""
+    step = sigma_kev / STEPS_OF_SIGMA
+    # number of grid points for tails and their noise; the first quarter is below 0
+    above = max(2 * float(energies[-1]), float(kev.max())) + ROOM * sigma_kev
+    below = max(0.0, -float(kev.min())) + ROOM * sigma_kev
+    needed = max(4 * above / 3, 4 * below) / step
+    points = int(np.clip(2 ** np.ceil(np.log2(needed)), LEAST_GRID, MOST_GRID))
+    arguments = np.asarray(2 * np.pi * np.fft.rfftfreq(points, step), float)
+    conjugates = np.conj(characteristic_exponents(arguments, energies)).T
+    exponents = np.ascontiguousarray(conjugates).view(np.float64)  # (energies, 2 of arguments)
+    first = points // 4
+    grid = (np.arange(points) - first) * step
+    wings, widths = _wings(kev, sigma_kev)
+    floor = OUTLIERS / max(float(np.ptp(kev)), step)
+
+    def likelihood(expected: float, level: float, sigma: float, weights: FloatArray) -> float:
+        # beyond this the noise term is negligible; shorter arrays are also allocated faster
+        u = arguments[: np.searchsorted(arguments, NEGLIGIBLE / sigma)]
+        parts = weights @ exponents[:, : 2 * len(u)]
+        parts *= expected
+        squares = -0.5 * (sigma * u) ** 2
+        parts[::2] += squares
+        parts[1::2] -= u * (level + first * step)
+        spectrum = parts.view(np.complex128)
+        np.exp(spectrum, out=spectrum)
+        if wings:
+            spectrum *= 1 - wings + wings * np.exp((widths**2 - 1) * squares)
+        density = np.maximum(np.fft.irfft(spectrum, points) / step, 0.0)
+        at = np.interp(kev, grid, density, left=0.0, right=0.0)
+        return float(np.log((1 - OUTLIERS) * at + floor).sum())
+
+    return likelihood
+
+
+def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
+    """Fraction and relative width of a second, wider Gaussian fitted to the side below 0."""
+    below, start = kev[kev < 0], float(np.log(sigma_kev))
+    limits = [(start + WINGS[0], start + WINGS[1]), WINGS, WINGS]
+
+    def cost(sigma: float, share: float, width: float) -> float:
+        core, wide = below / sigma, below / (width * sigma)
+        density = (1 - share) * np.exp(-0.5 * core**2) + share / width * np.exp(-0.5 * wide**2)
+        return -float(np.log(density / sigma + 1e-30).sum())
+
+    def in_ranges(values: FloatArray) -> tuple[float, float, float]:
+        return np.exp(values[0]), MAX_WINGS / (1 + np.exp(-values[1])), 1.5 + np.exp(values[2])
+
+    if len(below) < MIN_BELOW:
+        return 0.0, 1.0
+    alone = _best(lambda v: cost(np.exp(v[0]), 0.0, 1.0), [[start]], limits[:1])
+    wide = _best(lambda v: cost(*in_ranges(v)), [[start, -1.0, 0.0]], limits)
+    if wide.fval > alone.fval - WORTH:
+        return 0.0, 1.0
+    _, share, width = in_ranges(np.array(wide.values))
+    return float(share), float(width)
+
+
+def _best(
+    cost: Callable[[FloatArray], float],
+    starts: Sequence[Sequence[float]],
+    limits: Sequence[tuple[float, float] | None],
+) -> Minuit:
+    """The best fit from several starts, with limits of each parameter."""
+    fits = [Minuit(cost, np.array(start)) for start in starts]
+    for fit in fits:
+        fit.errordef, fit.limits = Minuit.LIKELIHOOD, limits
+        fit.errors = [0.5, *[0.4] * (fit.npar - 1)]
+        fit.simplex().migrad()
+    return min(fits, key=lambda fit: fit.fval)

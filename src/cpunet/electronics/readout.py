@@ -16,10 +16,9 @@ import numpy.typing as npt
 from numba import prange
 from scipy import fft
 
-from cpunet.electronics.chain import REFERENCE_KEV, Electronics, NoiseSpectrum
-from cpunet.electronics.drawn_pile_up import InTracePileUp
-from cpunet.electronics.exponentials import FloatArray
-from cpunet.electronics.tails_law import LIFETIMES, earlier_pulses
+from cpunet.electronics.baseline_noise import require_energies
+from cpunet.electronics.chain import REFERENCE_KEV, Electronics, FloatArray, NoiseSpectrum
+from cpunet.electronics.drawn_pile_up import LIFETIMES, InTracePileUp, earlier_pulses
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.pulses.container import FloatArray as PulseArray
@@ -27,7 +26,7 @@ from cpunet.pulses.container import Pulses
 
 
 def linear_response(
-    pulses: Pulses, electronics: Electronics, shift_ns: npt.ArrayLike | None = None
+    pulses: Pulses, electronics: Electronics, shift_ns: FloatArray | float = 0.0
 ) -> FloatArray:
     r"""Noise-free traces of charge pulses, in units of the full charge.
 
@@ -82,9 +81,8 @@ def linear_response(
             f"{where}: bandwidth_poles_ns means {min(poles):.3g} ns, faster than the pulses' "
             f"grid of {pulses.dt_ns:g} ns; correct it, or simulate them with a shorter period"
         )
-    n, dt, fine = len(pulses), electronics.dt_ns, pulses.dt_ns
-    shift = np.broadcast_to(0.0 if shift_ns is None else np.asarray(shift_ns, float), (n,))
-    start = electronics.n_pre * dt + shift
+    dt, fine = electronics.dt_ns, pulses.dt_ns
+    start = electronics.n_pre * dt + np.zeros(len(pulses)) + shift_ns
     first = np.floor(start / dt).astype(np.int64)
     phase = start - first * dt
     # position of the first clock tick within a fine sample, and the index of that sample
@@ -92,8 +90,8 @@ def linear_response(
     first_tick = np.rint((dt - phase - tick) / fine).astype(np.int64)
     # For y' = p y + x at constant x, y changes over a step by e y + a x with e = exp(p h) - 1,
     # and its integral is a y + b x. Steps end at a tick, begin there, or last a whole sample.
-    transfer, traces = electronics.transfer, np.zeros((n, electronics.length))
-    steps_ns = np.stack([tick, fine - tick, np.full(n, dt)], axis=1)[..., np.newaxis]
+    transfer, traces = electronics.transfer, np.zeros((len(pulses), electronics.length))
+    steps_ns = np.stack([tick, fine - tick, np.full_like(tick, dt)], axis=1)[..., np.newaxis]
     gain = np.expm1(transfer.poles * steps_ns)
     a = gain / transfer.poles
     factors = np.stack([1 + gain, a, (a - steps_ns) / transfer.poles], axis=-1)
@@ -108,11 +106,14 @@ def _follow(
     factors: Any,
     weights: Any,
     first: Any,
-    first_tick: Any,
+    ticks: Any,
     per_sample: int,
     traces: Any,
 ) -> None:  # pragma: no cover - compiled
-    """Fill each trace: fine steps while charge moves, each in two parts, then whole samples."""
+    """Fill each trace: fine steps while charge moves, each in two parts, then whole samples.
+
+    `ticks` are the fine samples with the first tick of the digitiser's clock.
+    """
     n_fine, length = pulses.shape[1], traces.shape[1]
     for i in prange(len(pulses)):
         state = np.zeros(len(weights), np.complex128)
@@ -124,7 +125,7 @@ def _follow(
             for k in range(len(state)):
                 total[k] += step[k, 1] * state[k] + step[k, 2] * x
                 state[k] = step[k, 0] * state[k] + step[k, 1] * x
-            since = j - first_tick[i]
+            since = j - ticks[i]
             if part == 2 or (part == 0 and since >= 0 and since % per_sample == 0):
                 value = 0.0
                 for k in range(len(state)):
@@ -178,17 +179,15 @@ def noise_power(spectrum: NoiseSpectrum, dt_ns: float, n_samples: int) -> FloatA
     """
     frequency_MHz = fft.rfftfreq(n_samples, dt_ns * 1e-3)
     slow = frequency_MHz / (spectrum.excess_corner_kHz * 1e-3)
-    power = (1 + spectrum.excess / (1 + slow**2)) / (
-        1 + (frequency_MHz / spectrum.corner_MHz) ** spectrum.order
-    )
+    fast = (frequency_MHz / spectrum.corner_MHz) ** spectrum.order
+    power = (1 + spectrum.excess / (1 + slow**2)) / (1 + fast)
     power[0] = 0
     if n_samples % 2 == 0:
         power[-1] /= 2  # the Nyquist bin covers half a frequency step
     power *= (1 - sum(line.power_fraction for line in spectrum.lines)) / power.sum()
     for line in spectrum.lines:
-        power[max(1, np.abs(frequency_MHz - line.frequency_MHz).argmin())] += (
-            line.power_fraction
-        )
+        nearest = np.abs(frequency_MHz - line.frequency_MHz).argmin()
+        power[max(1, nearest)] += line.power_fraction
     return np.asarray(power, np.float64)
 
 
@@ -247,21 +246,18 @@ def draw_other_pulses(
     tails, within = rng.spawn(2)
     # pile-up tails with all decays of the chain: a step response is a sum of exponentials, and
     # so is the sum of many tails
-    n, transfer = len(pulses), electronics.transfer
+    n, transfer, dt_ns = len(pulses), electronics.transfer, electronics.dt_ns
     longest_us = LIFETIMES * max(part.tau_us for part in electronics.decays)
     rate_khz, energies_kev = electronics.earlier_pulses.rate_kHz, electronics.other_pulses_kev
     row, kev, before_us = earlier_pulses(n, rate_khz, longest_us, energies_kev, tails)
-    weights = transfer.residues / transfer.poles
     modes = kev[:, np.newaxis] * np.exp(1e3 * before_us[:, np.newaxis] * transfer.poles)
-    heights = np.zeros((n, len(weights)), np.complex128)
-    np.add.at(heights, row, modes * weights)
-    centres_ns = (np.arange(electronics.length) + 0.5) * electronics.dt_ns
+    heights = np.zeros((n, len(transfer.poles)), np.complex128)
+    np.add.at(heights, row, modes * (transfer.residues / transfer.poles))
+    centres_ns = (np.arange(electronics.length) + 0.5) * dt_ns
     decays = np.exp(transfer.poles[:, np.newaxis] * centres_ns)
     added_kev = np.ascontiguousarray((heights @ decays).real)
-    # before piled-up pulses are added
-    tails_kev = added_kev[:, 0].copy()
-    rate_khz, dt_ns = electronics.pile_up.rate_kHz, electronics.dt_ns
-    record = electronics.n_pre, electronics.length
+    tails_kev = added_kev[:, 0].copy()  # before piled-up pulses are added
+    rate_khz, record = electronics.pile_up.rate_kHz, (electronics.n_pre, electronics.length)
     piled = InTracePileUp.draw(n, rate_khz, energies_kev, dt_ns, *record, within)
     # with shapes of randomly chosen pulses
     shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
@@ -317,15 +313,16 @@ def by_height(
     kev
         Height in keV of a signal of 1, a number or of shape ``(pulses, 1)``.
     """
-    if electronics.slew_kev_per_ns is None and electronics.nonlinearity is None:
+    slew, off = electronics.slew_kev_per_ns, electronics.nonlinearity
+    if slew is None and off is None:
         return signal
     result = kev * signal
-    if electronics.slew_kev_per_ns is not None:
-        limit = electronics.slew_kev_per_ns * electronics.dt_ns
+    if slew is not None:
+        limit = slew * electronics.dt_ns
         for i in range(1, result.shape[1]):
             ahead = result[:, i] - result[:, i - 1]
             result[:, i] = result[:, i - 1] + limit * np.tanh(ahead / limit)
-    if (off := electronics.nonlinearity) is not None:
+    if off is not None:
         full = electronics.adc_top / electronics.gain_adc_per_kev
         result += off.fraction * full * np.sin(2 * np.pi * off.waves * result / full)
     return result / kev
@@ -358,13 +355,7 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     ((2, 1400), dtype('uint16'))
     """
     energy, n = pulses.energy_kev, len(pulses)
-    bad = ~(np.isfinite(energy) & (energy > 0))
-    if bad.any():
-        i = int(bad.argmax())
-        raise CpunetError(
-            f"event {pulses.event_number[i]}: energy {energy[i]} keV; the readout needs an "
-            "energy above 0 for each pulse"
-        )
+    require_energies(energy, pulses.event_number)
     clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
     # a uniform clock phase plus trigger jitter
     shift_ns = clock.uniform(0, electronics.dt_ns, size=n)
@@ -372,23 +363,21 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     response = linear_response(pulses, electronics, shift_ns)
     added_kev, tails_kev, piled = draw_other_pulses(pulses, electronics, others)
     n_piled, piled_kev, piled_ns = (values for values, _ in piled.columns().values())
-    spectrum, length, dt_ns = electronics.noise.spectrum, electronics.length, electronics.dt_ns
-    unit = coloured_noise(spectrum, n, length, dt_ns, noise)
-    total_kev = energy[:, None] * response + added_kev
-    total_kev += unit * np.float32(electronics.noise.rms_kev)
+    own, dt_ns = electronics.noise, electronics.dt_ns
+    unit = coloured_noise(own.spectrum, n, electronics.length, dt_ns, noise)
+    total_kev = energy[:, None] * response + added_kev + unit * np.float32(own.rms_kev)
     total_kev = by_height(total_kev, electronics)
-    baseline = level.normal(
-        electronics.baseline_mean_adc, electronics.baseline_spread_adc, size=n
-    )
+    mean, spread = electronics.baseline_mean_adc, electronics.baseline_spread_adc
+    baseline = level.normal(mean, spread, size=n)
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
-    flags = tails_kev > electronics.noise.rms_kev, n_piled > 0, beyond.any(axis=1)
+    flags = tails_kev > own.rms_kev, n_piled > 0, beyond.any(axis=1)
     # the resolution grows with the root of the energy
     fwhm_kev = np.sqrt(electronics.resolution_fwhm_kev**2 / REFERENCE_KEV * energy)
     smeared = np.random.default_rng(int(resolution.integers(2**63)))
     return RawTraces(
         waveforms=cast(PulseArray, np.clip(adc, 0, electronics.adc_top).astype(np.uint16)),
-        dt_ns=electronics.dt_ns,
+        dt_ns=dt_ns,
         energy_kev=smeared.normal(energy, fwhm_kev / math.sqrt(8 * math.log(2))),
         event_number=pulses.event_number,
         peak=pulses.peak,

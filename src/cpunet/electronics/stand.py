@@ -33,11 +33,8 @@ from cpunet.tables import counted
 Labels = npt.NDArray[np.int64]
 
 MARKER = "stand.json"
-STAND = FolderKind(
-    name="stand",
-    command="cpunet stand",
-    own=r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz",
-)
+_FILES = r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz"
+STAND = FolderKind("stand", "cpunet stand", own=_FILES)
 # Truth about each measured trace besides its line, in ``data_labels.npz``.
 OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
 MADE = {MADE_BY: f"cpunet stand {cpunet.__version__}"}
@@ -185,8 +182,7 @@ def make_stand(
             raise CpunetError(f"`events` {window.name}={number}: give at least 1 event")
     if physics.step_ns > _COARSEST_NS:
         raise CpunetError(
-            f"settings: step_ns = {physics.step_ns:g}: a stand needs steps of at most "
-            f"{_COARSEST_NS:g} ns; lower it"
+            f"settings: step_ns: a stand needs steps of at most {_COARSEST_NS:g} ns; lower it"
         )
     # The chain follows pulses of the longest period that is a part of that of the digitiser, of
     # whole steps, at most 4 ns, and at most half of `dt_ns` unless a step is as long.
@@ -204,15 +200,9 @@ def make_stand(
         columns = _write_data(folder, data, seeds[2], chain)
         lines = (np.bincount(of, minlength=len(LABELS)) for of in (label, columns["label"]))
         sim_lines, data_lines = (dict(zip(LABELS, of.tolist(), strict=True)) for of in lines)
-        counts = {
-            "n_sim": len(label),
-            "n_data": len(columns["label"]),
-            "sim_lines": sim_lines,
-            "data_lines": data_lines,
-            "flags": {
-                name: int((columns["flag"] & bit > 0).sum()) for name, bit in FLAGS.items()
-            },
-        }
+        flags = {name: int((columns["flag"] & bit > 0).sum()) for name, bit in FLAGS.items()}
+        counts: dict[str, Any] = {"n_sim": len(label), "n_data": len(columns["label"])}
+        counts |= {"sim_lines": sim_lines, "data_lines": data_lines, "flags": flags}
         made = {
             "cpunet": cpunet.__version__,
             "shift": moved.model_dump(mode="json") if shift else None,
@@ -272,10 +262,8 @@ class Side:
                 calibrated = replace(pulses, energy_kev=gain * pulses.energy_kev)
                 yield calibrated, labels, events.hits[detected]
         if not gain:
-            raise CpunetError(
-                f"none of {opened.n_events} events gives a signal in {self.detector.name}; "
-                "give more `events`"
-            )
+            name = self.detector.name
+            raise CpunetError(f"no event gives a signal in {name}; give more `events`")
 
 
 def _write_sim(folder: Path, side: Side, electronics: Electronics) -> Labels:
@@ -283,22 +271,14 @@ def _write_sim(folder: Path, side: Side, electronics: Electronics) -> Labels:
     labels: list[Labels] = []
     per_sample = round(electronics.dt_ns / side.settings.dt_ns)
     # the truth grows in a file of its own: it may be larger than memory
-    rows = folder / "truth.rows"
-    with (
-        rows.open("wb") as truth,
-        PulseWriter(folder / "sim.lh5", attrs=MADE | {SIDE: "simulated"}) as writer,
-    ):
+    rows, attrs = folder / "truth.rows", MADE | {SIDE: "simulated"}
+    with rows.open("wb") as truth, PulseWriter(folder / "sim.lh5", attrs=attrs) as writer:
         for fine, label, hits in side.blocks("Simulated events"):
             # each sample is the mean over the digitiser's period
             whole = fine.length // per_sample * per_sample
             parts = fine.waveforms[:, :whole].reshape(len(fine), -1, per_sample)
-            means = Pulses.of(
-                parts.mean(axis=2),
-                dt_ns=fine.dt_ns * per_sample,
-                energy_kev=fine.energy_kev,
-                event_number=fine.event_number,
-            )
-            writer.append(means)
+            dt_ns = fine.dt_ns * per_sample
+            writer.append(replace(fine, waveforms=parts.mean(axis=2), dt_ns=dt_ns))
             writer.append_rows(HIT_TABLE, hit_columns(hits))
             true = linear_response(fine, electronics)
             true = by_height(true, electronics, fine.energy_kev[:, np.newaxis])
@@ -307,13 +287,9 @@ def _write_sim(folder: Path, side: Side, electronics: Electronics) -> Labels:
         simulation = {"cpunet": cpunet.__version__, **side.provenance()}
         simulation["settings"] |= {"dt_ns": electronics.dt_ns}  # that of the means
         writer.annotate(SIMULATION, json.dumps(simulation))
-    label = np.concatenate(labels)
-    np.savez(
-        folder / "truth.npz",
-        response=np.memmap(rows, np.float32, "r", shape=(len(label), electronics.length)),
-        label=label,
-        n_pre=np.array(electronics.n_pre),
-    )
+    label, n_pre = np.concatenate(labels), np.array(electronics.n_pre)
+    response = np.memmap(rows, np.float32, "r", shape=(len(label), electronics.length))
+    np.savez(folder / "truth.npz", response=response, label=label, n_pre=n_pre)
     rows.unlink()
     return label
 
@@ -322,17 +298,15 @@ def _write_data(
     folder: Path, side: Side, seed: int, electronics: Electronics
 ) -> dict[str, npt.NDArray[Any]]:
     """Write ``data.lh5``, and the lines and flags of its traces, which it returns."""
-    columns: dict[str, list[npt.NDArray[Any]]] = {name: [] for name in ("label", *OF_DATA)}
+    parts: list[dict[str, npt.NDArray[Any]]] = []
     path, attrs = folder / "data.lh5", MADE | {SIDE: "measured"}
     with PulseWriter(path, table="geds/raw", waveform_units="ADC", attrs=attrs) as writer:
         for fine, label, _ in side.blocks("Measured events"):
             block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
             writer.append(traces)
-            columns["label"].append(label)
-            for name in OF_DATA:
-                columns[name].append(getattr(traces, name))
-    whole: dict[str, Any] = {name: np.concatenate(values) for name, values in columns.items()}
+            parts.append({"label": label} | {name: getattr(traces, name) for name in OF_DATA})
+    whole: dict[str, Any] = {n: np.concatenate([part[n] for part in parts]) for n in parts[0]}
     saturated = whole["flag"] & FLAGS["saturated"] > 0
     if 2 * saturated.sum() > len(saturated):
         raise CpunetError(

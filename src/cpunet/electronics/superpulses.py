@@ -23,20 +23,12 @@ import scipy.fft
 import scipy.optimize
 import scipy.signal
 
-from cpunet.electronics.baseline_methods import (
-    LONGEST_NS,
-    BaselineMethod,
-    Kernel,
-    Spectrum,
-    Values,
-    currents,
-    fit_rc,
-    fitted,
-)
-from cpunet.electronics.finishing import record_length
+from cpunet.electronics.baseline_methods import LONGEST_NS, Kernel, currents, fit_rc, fitted
+from cpunet.electronics.chain import ComplexArray as Spectrum
+from cpunet.electronics.chain import FloatArray as Values
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
-from cpunet.pulses.parameters import last_below
+from cpunet.pulses.parameters import crossings
 
 SLICES = 8
 SINGLE_SITE = 0.35  # fraction of the pulses of a slice that is used
@@ -60,12 +52,7 @@ def crossing(steps: Values, fraction: float) -> Values:
     array([2.25])
     """
     top = (steps >= RISE_END).argmax(axis=1)
-    last = last_below(steps, top, np.full(len(steps), fraction))
-    crossed, last = last >= 0, np.minimum(last, steps.shape[1] - 2)
-    rows = np.arange(len(steps))
-    low, high = steps[rows, last], steps[rows, last + 1]
-    rise = np.where(crossed, high - low, 1.0)
-    return np.asarray(np.where(crossed, last + (fraction - low) / rise, np.nan), float)
+    return crossings(steps, np.full(len(steps), fraction), top)
 
 
 def slices(current: Values) -> list[npt.NDArray[np.int64]]:
@@ -124,29 +111,30 @@ def aligned(spectra: Spectrum, response: Values) -> Spectrum:
     return np.asarray(spectra * phases.reshape(n, -1)[:, :bins])
 
 
-def gauss_exp(dt_ns: float, sigma_ns: float, tau_ns: float, length: int) -> Spectrum:
-    r"""A Gaussian and an exponential, at the frequencies of a record.
+def gauss_exp(s: Spectrum, sigma_ns: float, tau_ns: float) -> Spectrum:
+    r"""A Gaussian and an exponential, at :math:`s = i \omega` in 1/ns.
 
     .. math:: H(\omega) = \frac{e^{-\sigma^2 \omega^2 / 2}}{1 + i \omega \tau}
     """
-    omega = 2e-3 * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
-    gauss = np.exp(-0.5 * (omega * sigma_ns) ** 2)
-    return np.asarray(gauss / (1 + 1j * omega * tau_ns), complex)
+    return np.asarray(np.exp(-0.5 * (s.imag * sigma_ns) ** 2) / (1 + s * tau_ns))
 
 
-def rc_late(
-    dt_ns: float, tau_ns: float, late_share: float, late_ns: float, length: int
-) -> Spectrum:
-    r"""An RC integration with a part of the charge that comes late.
+def rc_late(s: Spectrum, tau_ns: float, late_share: float, late_ns: float) -> Spectrum:
+    r"""An RC integration with a part of the charge that comes late, at :math:`s = i \omega`.
 
     .. math:: H(\omega) = \frac{1}{1 + i \omega \tau}
         \left(1 - w + \frac{w}{1 + i \omega T}\right)
 
     with the share :math:`w` of the late charge and its time constant :math:`T`.
     """
-    s = 2e-3j * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
     late = late_share / (1 + s * late_ns)
-    return np.asarray((1 - late_share + late) / (1 + s * tau_ns), complex)
+    return np.asarray((1 - late_share + late) / (1 + s * tau_ns))
+
+
+def with_spectra(windows: FloatArray, dt_ns: float) -> tuple[Values, Spectrum]:
+    """Currents of windows and their spectra, see `currents`."""
+    current = currents(windows, dt_ns)
+    return current, np.asarray(scipy.fft.rfft(current, axis=1))
 
 
 def fit_kernel(
@@ -158,12 +146,12 @@ def fit_kernel(
     *,
     late: bool = False,
 ) -> Kernel:
-    """A kernel with parameters, fitted to superpulses.
+    r"""A kernel with parameters, fitted to superpulses.
 
     Parameters
     ----------
     transfer
-        Transfer function: a function of the period in ns, the parameters and the length.
+        Transfer function: a function of :math:`i \omega` in 1/ns and the parameters.
     parameters
         Where each starts, its largest value (the smallest is 0), and its scale, by name.
     sim, steps, dt_ns
@@ -172,9 +160,12 @@ def fit_kernel(
         Whether a part of the charge comes late. It counts for little in currents, so charges
         are compared.
     """
-    (best, high, scale), names = np.transpose([*parameters.values()]), [*parameters]
-    measured, edge = currents(steps, dt_ns), round(EDGE_NS / dt_ns)
-    length = record_length(sim.shape[1], dt_ns)
+    best, high, scale = np.transpose([*parameters.values()])
+    (measured, of_data), (current, of_sim) = (
+        with_spectra(side, dt_ns) for side in (steps, sim)
+    )
+    length, edge = current.shape[1], round(EDGE_NS / dt_ns)
+    s = 2e-3j * np.pi * scipy.fft.rfftfreq(length, 1e-3 * dt_ns)  # 1/ns
 
     def mean_currents(parts: Sequence[Spectrum], kernel: Spectrum | float = 1.0) -> Values:
         """Mean currents of slices around the half maximum, shape ``(slices, 2 * edge)``."""
@@ -184,29 +175,18 @@ def fit_kernel(
         around = np.roll(scipy.fft.irfft(means, length, axis=1), edge, axis=1)
         return np.asarray(around[:, : 2 * edge], float)
 
-    def residual(at: Values, parts: Sequence[Spectrum]) -> Values:
-        off = mean_currents(parts, transfer(dt_ns, *at, length)) - wanted
+    def residual(at: Values) -> Values:
+        off = mean_currents(sliced, transfer(s, *at)) - wanted
         return np.asarray(np.cumsum(off, axis=1) if late else off).ravel()
 
-    of_data, of_sim = (
-        np.asarray(scipy.fft.rfft(current, axis=1), complex)
-        for current in (measured, currents(sim, dt_ns))
-    )
     wanted = mean_currents([of_data[rows] for rows in slices(measured)])
     for _ in range(FITTED_ROUNDS):
-        response = of_sim * transfer(dt_ns, *best, length)
-        sliced = [of_sim[rows] for rows in slices(scipy.fft.irfft(response, length, axis=1))]
+        response = scipy.fft.irfft(of_sim * transfer(s, *best), length, axis=1)
+        sliced = [of_sim[rows] for rows in slices(response)]
         best = scipy.optimize.least_squares(
-            residual,
-            best,
-            bounds=(0.0, high),
-            x_scale=scale,
-            diff_step=1e-3,
-            xtol=1e-4,
-            args=(sliced,),
+            residual, best, bounds=(0.0, high), x_scale=scale, diff_step=1e-3, xtol=1e-4
         ).x
-    values = dict(zip(names, best.tolist(), strict=True))
-    return partial(transfer, dt_ns, *values.values()), values
+    return transfer(s, *best), dict(zip(parameters, best.tolist(), strict=True))
 
 
 def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
@@ -219,7 +199,8 @@ def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
     simulation, :math:`\sigma_D` and :math:`\sigma_S` their statistical errors. For the
     parameters see `fitted`.
     """
-    length, current = record_length(sim.shape[1], dt_ns), currents(steps, dt_ns)
+    (current, of_data), (_, spectra) = (with_spectra(side, dt_ns) for side in (steps, sim))
+    length = current.shape[1]
 
     def mean_spectra(spectra: Spectrum, response: Values) -> tuple[Spectrum, Values]:
         """Mean spectrum of each slice, and its squared standard error.
@@ -230,23 +211,26 @@ def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
         error = np.array([part.var(axis=0) / max(1, len(part) - 1) for part in moved])
         return np.array([part.mean(axis=0) for part in moved]), error
 
-    measured, data_error = mean_spectra(np.asarray(scipy.fft.rfft(current, axis=1)), current)
+    measured, data_error = mean_spectra(of_data, current)
     wiener = np.clip(1 - data_error.sum(axis=0) / (np.abs(measured) ** 2).sum(axis=0), 0, 1)
     lead, lag, fade_in, fade_out = (
         round(time / dt_ns) for time in (LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS)
     )
-    fades = np.ones(lead + lag)
-    begin, end = (
-        np.sin(0.5 * np.pi * (np.arange(n) + 0.5) / n) ** 2 for n in (fade_in, fade_out)
-    )
-    fades[:fade_in], fades[-fade_out:] = begin, end[::-1]
-    spectra = np.asarray(scipy.fft.rfft(currents(sim, dt_ns), axis=1))
+    phase = 0.5 * np.pi * (np.arange(lead + lag) + 0.5)
+    phase = np.minimum(phase / fade_in, phase[::-1] / fade_out)
+    fades = np.sin(phase.clip(max=0.5 * np.pi)) ** 2
     kernel = np.zeros(lead + lag)
     kernel[lead] = 1.0
+
+    def transfer() -> Spectrum:
+        """Transfer function of the kernel, which begins `lead` samples before zero delay."""
+        around_zero = np.pad(kernel, (0, length - len(kernel)))
+        return np.asarray(scipy.fft.rfft(np.roll(around_zero, -lead)))
+
     for _ in range(FREE_ROUNDS):
         # The simulated pulses are placed by the half maximum of their response. A shift
         # of their own half maximum does not give this exactly.
-        response = scipy.fft.irfft(spectra * free(kernel, lead, length), length, axis=1)
+        response = scipy.fft.irfft(spectra * transfer(), length, axis=1)
         simulated, sim_error = mean_spectra(spectra, response)
         below = (np.abs(simulated) ** 2 + sim_error).sum(axis=0)
         ratio = wiener * (measured * simulated.conj()).sum(axis=0) / below
@@ -254,19 +238,8 @@ def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
         kernel /= kernel.sum()
     time_ns = np.arange(len(kernel)) * dt_ns
     mean_ns = float(kernel @ time_ns)
-    variance = float(kernel @ (time_ns - mean_ns) ** 2)
-    values = {
-        "kernel_mean_ns": mean_ns - LEAD_NS,
-        "kernel_rms_ns": float(np.sqrt(max(variance, 0.0))),
-    }
-    return partial(free, kernel, lead), values
-
-
-def free(kernel: Values, lead: int, length: int) -> Spectrum:
-    """Transfer function of a kernel that begins `lead` samples before zero delay."""
-    around_zero = np.zeros(length)
-    around_zero[: len(kernel)] = kernel
-    return np.asarray(scipy.fft.rfft(np.roll(around_zero, -lead)), complex)
+    rms_ns = float(np.sqrt((kernel @ (time_ns - mean_ns) ** 2).clip(min=0.0)))
+    return transfer(), {"kernel_mean_ns": mean_ns - LEAD_NS, "kernel_rms_ns": rms_ns}
 
 
 # Where parameters start, their largest values, and their scales.
@@ -275,7 +248,7 @@ _GAUSS_EXP = {"sigma_ns": _WIDTH, "tau_ns": _WIDTH}
 _RC_LATE = {"tau_ns": _WIDTH, "late_share": (0.05, 0.5, 1.0)}
 _RC_LATE["late_ns"] = 400.0, 4 * LONGEST_NS, LONGEST_NS
 _rc_late = partial(fit_kernel, rc_late, _RC_LATE, late=True)
-BASELINE_METHODS: dict[str, Callable[[FloatArray, FloatArray, float, int], BaselineMethod]] = {
+BASELINE_METHODS = {
     "rc": partial(fitted, fit_rc, 4000),
     "rc_late": partial(fitted, _rc_late, 2000, late=True),
     "gauss_exp": partial(fitted, partial(fit_kernel, gauss_exp, _GAUSS_EXP), 2000),

@@ -80,7 +80,7 @@ def equivalent_kernel(undecayed: StepResponse) -> dict[str, float]:
 
     Examples
     --------
-    >>> from cpunet.electronics.exponentials import Exponentials
+    >>> from cpunet.electronics.chain import Exponentials
     >>> chain = Exponentials.low_pass(60.0) * Exponentials.low_pass(30.0)
     >>> nearest = equivalent_kernel(chain.step)
     >>> 10 < nearest["sigma_ns"] < 30, 60 < nearest["tau_ns"] < 90

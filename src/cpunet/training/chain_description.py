@@ -23,8 +23,7 @@ from scipy.interpolate import CubicSpline
 from scipy.ndimage import uniform_filter1d
 
 from cpunet.electronics.baseline_noise import record_samples
-from cpunet.electronics.chain import Decay, Electronics
-from cpunet.electronics.exponentials import Exponentials, FloatArray, moved_apart
+from cpunet.electronics.chain import Decay, Electronics, Exponentials, FloatArray, moved_apart
 from cpunet.electronics.readout import noise_power
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
@@ -163,15 +162,14 @@ def learned_chain(response: ElectronicsResponse, name: str) -> Chain:
     taus = moved_apart([*poles, *response.slow_ns.tolist(), 1e3 * main, *fast_ns])
     n, n_slow = len(poles), len(slow)
     slow_taus = taus[n : n + n_slow]
-    rates = [weight / tau for weight, tau in zip(slow, slow_taus, strict=True)]
-    undecayed = Exponentials.of_real(1 - sum(slow), slow_taus, rates)
+    undecayed = Exponentials.of_step(1.0, [-weight for weight in slow], slow_taus)
     for tau in taus[:n]:
         undecayed = undecayed * Exponentials.low_pass(tau)
     shares, decays = [1 - sum(fast), *fast], taus[n + n_slow :]
     if response.config.deviations:  # those of samples, whose decays are half a period late
         sooner = np.exp(0.5 * float(response.dt_ns) / np.array(decays))
         shares = (sooner * shares).tolist()
-    whole = undecayed * Exponentials.decaying(shares, decays)
+    whole = undecayed * Exponentials.of_step(0.0, shares, decays)
     if not response.config.deviations:
         return Chain(name, whole.step, undecayed.step)
     # a sample is the mean over its period
