@@ -15,8 +15,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
 from cpunet.electronics.drawn_pile_up import TailsLaw, tail_shape
+from cpunet.electronics.pile_up_tails import PileUpTails, read_baselines
 from cpunet.plotting import COLOURS, DATA_FILL, styled
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import FloatArray, Pulses

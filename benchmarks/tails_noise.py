@@ -17,8 +17,8 @@ from rich.console import Console
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.electronics.drawn_pile_up import TailsLaw
+from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.reading.files import open_pulses
 from cpunet.pulses.writing import PulseWriter
