@@ -34,7 +34,7 @@ from cpunet.networks.positional_unet import GruDiscriminator, PositionalUNet
 from cpunet.recipes import schema
 from cpunet.training.run import Record
 from cpunet.training.unfinished import State, waiting_signals
-from cpunet.training.views import WON, Judge, Sides, View, half_sample
+from cpunet.training.views import HEART, WON, Judge, Sides, View, half_sample
 
 log = logging.getLogger(__name__)
 
@@ -184,7 +184,9 @@ class Game:
             for side, network in self.critics.items()
         }
         unseen = min(len(side.pulses) - side.seen for side in sides[:2])
-        self.judge, self.lazy = Judge([*real], unseen), LAZY if gru else 1
+        solved = ren.linear is not None and not [*ren.linear.parameters()]
+        self.judge = Judge([*real], unseen, 0.0 if solved else HEART)
+        self.lazy = LAZY if gru else 1
         self.iteration = 0
         names = "generators", "critics", "average", "good"
         self.parts: dict[str, Any] = {name: getattr(self, name) for name in names}

@@ -27,8 +27,8 @@ from cpunet.recipes.schema import ConvolutionalConfig, GruConfig, PreparationCon
 log = logging.getLogger(__name__)
 
 RECENT = 20  # judgements that are averaged
-# Part of unseen pairs on which a critic is right that has won, and by how much more it is right
-# on its own if it knows them by heart; parts of a training before which neither is decided.
+# Part of unseen pairs on which a critic is right that has won; by how much more it is right on
+# its own if it knows them by heart; parts of a training before which neither is decided.
 WON, HEART, EARLY, HALF = 0.97, 0.1, 0.25, 0.5
 BEFORE_NS, END_NS = 3200.0, 64.0  # before the half maximum; left out at the end of a window
 BASE_NS, LEVEL_NS = (-3200.0, -1600.0), (4800.0, 5600.0)  # which are scaled to 0 and 1
@@ -111,6 +111,9 @@ class Judge:
         Names of the critics.
     unseen
         Number of pulses of a side that are held out.
+    heart
+        By how much more a critic that knows its pulses by heart is right on them.  A game that
+        begins at a solution is over by chance on unseen pulses: 0.
 
     Attributes
     ----------
@@ -122,8 +125,9 @@ class Judge:
         The same, and that of unseen pulses, in the last judgements.
     """
 
-    def __init__(self, sides: Sequence[str], unseen: int) -> None:
-        self.unseen, self.over, self.right = unseen, dict[str, str](), dict[str, float]()
+    def __init__(self, sides: Sequence[str], unseen: int, heart: float = HEART) -> None:
+        self.unseen, self.heart = unseen, heart
+        self.over, self.right = dict[str, str](), dict[str, float]()
         self.recent: dict[str, list[tuple[float, float]]] = {side: [] for side in sides}
 
     def note(self, side: str, right: float, done: float) -> float:
@@ -137,7 +141,7 @@ class Judge:
         if mean > WON and done > HALF:
             self.over[side], end = "won", "its game ends here, and the average before counts"
             log.warning(f"the critic of {side} has won: it is {text}; {end}")
-        elif mean < 0.5 + 0.5 * self.unseen**-0.5 < own - HEART and done > EARLY:
+        elif mean < 0.5 + 0.5 * self.unseen**-0.5 < own - self.heart and done > EARLY:
             self.over[side], by = "heart", f"and on {100 * own:.0f} % of its own, by heart"
             log.info(f"the critic of {side} is {text}, {by}; its game ends here")
         return float(mean)
