@@ -158,12 +158,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("file", type=Path)
     parser.add_argument("--kev-per-adc", type=float)
-    parser.add_argument("--decay-us", type=float)
     parser.add_argument("--picture", type=Path)
     arguments = parser.parse_args()
     source = open_pulses(arguments.file, kev_per_adc=arguments.kev_per_adc)
     preparation = load_recipe("fast").at(16).preparation
-    tails = PileUpTails.of(Baselines.of(source.blocks(4096), preparation), arguments.decay_us)
+    tails = PileUpTails.of(Baselines.of(source.blocks(4096), preparation))
     raw = next(iter(source.blocks(4096)))
     console = Console()
     for name, value in tails.describe():
