@@ -9,6 +9,7 @@ Lines: TypeAlias = Sequence[tuple[str, str]]
 
 NO_VALUE = "–"
 MAX_DIGITS = 9  # after the decimal point
+ROUNDING = 1e-12  # of values of which an error is none
 SHOWN = 6  # names in a list
 
 
@@ -105,8 +106,9 @@ def with_std(value: Any, error: Any) -> str:
     if value is None or error is None:
         return number(value)
     # the exponent of the rounded error: 0.0996 is 0.10
-    exponent = int(f"{error:.1e}".partition("e")[2]) if error > 0 else -MAX_DIGITS
+    seen = error > abs(value) * ROUNDING
+    exponent = int(f"{error:.1e}".partition("e")[2]) if seen else -MAX_DIGITS
     digits = max(1 - exponent, 0)
     if digits >= MAX_DIGITS:
-        return f"{number(value)} ± {error:.2g}"
+        return f"{number(value)} ± {error if seen else 0:.2g}"
     return f"{value:.{digits}f} ± {error:.{digits}f}"

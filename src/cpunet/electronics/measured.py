@@ -18,6 +18,7 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.preparation import CutWindows, apply_cuts, prepare
 from cpunet.recipes.schema import PreparationConfig
 from cpunet.settings import plain
+from cpunet.tables import with_std
 
 log = logging.getLogger(__name__)
 
@@ -65,9 +66,9 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
         return TraceNoise(noise_of(data, pile_up)), info
     slopes = " (by slopes alone: levels do not follow the tilts)"
     log.info(
-        f"pile-up tails: {info.rate_khz:.2f} ± {info.rate_error_khz:.2f} kHz"
+        f"pile-up tails: {with_std(info.rate_khz, info.rate_error_khz)} kHz"
         f"{'' if pile_up.level_weight else slopes}, "
-        f"{info.percent_above['10_kev']['measured']:.2g} % of the traces above 10 keV; "
+        f"{info.percent_above['10_kev']['law']:.2g} % of the traces above 10 keV; "
         "translations are given them"
     )
     return TraceNoise(noise_of(data, pile_up), drawn), info

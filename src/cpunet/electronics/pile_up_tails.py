@@ -43,6 +43,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InfoPart
+from cpunet.tables import with_std
 
 MIN_LARGE = 20  # minimum number of large tails to determine coupling and decay time
 # A baseline whose level differs by more than this factor from what its tilt implies is not
@@ -240,10 +241,10 @@ class TailsInfo(InfoPart):
         if not self.rate_khz:
             return [("pile-up tails", "none significant")]
         shares = ", ".join(
-            f"{share['measured']:.2g} % above {size.partition('_')[0]} keV"
+            f"{share['law']:.2g} % above {size.partition('_')[0]} keV"
             for size, share in self.percent_above.items()
         )
-        rate = f"{self.rate_khz:.3g} ± {self.rate_error_khz:.2g} kHz"
+        rate = f"{with_std(self.rate_khz, self.rate_error_khz)} kHz"
         by = f"estimated from {self.told_by}, error {self.error_kev:.2g} keV"
         return [
             ("pile-up tails", f"{rate}, decaying with {self.decay_us:.3g} µs"),

@@ -24,6 +24,7 @@ from cpunet.pulses.reading.files import ALL, PulseFile, ReadOptions, Source
 from cpunet.pulses.shape_parameters import median_decay_ns
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed
+from cpunet.tables import with_std
 from cpunet.training.run import INFO, Run, RunLike, resolve_device, used_run
 from cpunet.translation.translator import REN
 from cpunet.validation.a_over_e import DEP, Range, dep_scales, survivals
@@ -157,10 +158,11 @@ def _validated(
             for size, share in tails.percent_above.items()
         )
         notes.append(
-            f"Traces of the training lie on pile-up tails, {tails.rate_khz:.2f} ± "
-            f"{tails.rate_error_khz:.2f} kHz decaying with {tails.decay_us:.1f} µs: "
-            f"percent of the traces, measured (by the law), {shares}. All translations and the "
-            "truth have tails drawn by this law, as likely as they pass the quality cuts."
+            "Traces of the training lie on pile-up tails, "
+            f"{with_std(tails.rate_khz, tails.rate_error_khz)} kHz decaying with "
+            f"{tails.decay_us:.1f} µs: percent of the traces, measured with an error (by "
+            f"the law), {shares}. All translations and the truth have tails drawn by this law, "
+            "as likely as they pass the quality cuts."
         )
     if truth is None:
         notes.append("No truth was given, so single pulses are not scored.")
