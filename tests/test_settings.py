@@ -152,6 +152,7 @@ WRONG = {
         ("preparation.before_ns=4800", "the loss windows cover 12800 ns"),
         ("preparation.baseline_ns=6400", "baseline_ns must be less than before_ns"),
     ],
+    "paper": [("discriminator.view=window", "view must be spread behind a linear part")],
     "fast": [
         ("training.method=cyclegan", "training"),
         ("training.start_factors=[a, 1]", "training.start_factors.0: "),
@@ -171,11 +172,13 @@ def test_wrong_settings_are_named(recipe, override, part):
     one_line(lambda: load_recipe(recipe, [override]), part)
 
 
-@pytest.mark.parametrize("dt_ns", [1, 2, 4, 8, 10, 12.5, 16])
+@pytest.mark.parametrize("dt_ns", [1, 2, 4, 7, 10, 12.5, 13, 16])
 def test_windows_of_networks_are_halved_four_times_at_any_period(dt_ns):
-    window = load_recipe("published").at(dt_ns).preparation
+    recipe = load_recipe("published").at(dt_ns)
+    window = recipe.preparation
     assert window.length % 16 == 0
     assert window.length * dt_ns == pytest.approx(12_800, abs=16 * dt_ns)
+    Recipe.model_validate(recipe.model_dump())  # as a run stores it
 
 
 def test_values_of_a_file_and_of_words(tmp_path: Path) -> None:

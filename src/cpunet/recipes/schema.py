@@ -357,8 +357,9 @@ class Recipe(Timed):
     def at(self, dt_ns: float) -> Self:
         """The same recipe for pulses with a sampling period in ns.
 
-        As published, networks halve their windows four times, and a GRU takes several samples
-        a step: either side of the alignment has the nearest multiple of so many samples.
+        A U-Net without a linear part halves its windows four times, and a GRU that reads
+        windows takes several samples a step: either side of the alignment has the nearest
+        multiple of so many samples, and the first and last windows of the losses follow.
 
         Examples
         --------
@@ -368,11 +369,22 @@ class Recipe(Timed):
         """
         timed, preparation = super().at(dt_ns), self.preparation
         if isinstance(self.generator, PunetConfig) and self.generator.linear == "none":
-            step = dt_ns * math.lcm(8, getattr(self.discriminator, "samples_per_step", 1))
-            sides = ("before_ns", "after_ns")
-            whole = {side: round(getattr(preparation, side) / step) * step for side in sides}
-            preparation = timed.preparation.model_copy(update=whole)
-            return timed.model_copy(update={"preparation": preparation})
+            critic, losses, samples = self.discriminator, timed.cyclegan.training.losses, 8
+            if isinstance(critic, GruConfig) and critic.view == "window":
+                samples = math.lcm(samples, critic.samples_per_step)
+            sides, step = (preparation.before_ns, preparation.after_ns), samples * dt_ns
+            before, after = (round(ns / step) * step for ns in sides)
+            whole = {"before_ns": before, "after_ns": after}
+            ends = {
+                "baseline_ns": losses.baseline_ns + before - preparation.before_ns,
+                "tail_ns": losses.tail_ns + after - preparation.after_ns,
+            }
+            training = {"losses": losses.model_copy(update=ends)}
+            parts = {
+                "preparation": timed.preparation.model_copy(update=whole),
+                "training": timed.training.model_copy(update=training),
+            }
+            return timed.model_copy(update=parts)
         return timed
 
     @property
@@ -427,6 +439,10 @@ class Recipe(Timed):
             return self
         if (self.cyclegan.generator.linear == "solved") == network:
             raise ValueError("generator.linear must be solved in a residual, and only in it")
+        critic = self.cyclegan.discriminator
+        windows = isinstance(critic, GruConfig) and critic.view == "window"
+        if windows and self.cyclegan.generator.linear != "none":
+            raise ValueError("discriminator.view must be spread behind a linear part")
         losses, window = self.cyclegan.training.losses, self.preparation
         covered = losses.baseline_ns + losses.rising_edge_ns + losses.tail_ns
         length = window.before_ns + window.after_ns
