@@ -8,6 +8,7 @@ import shutil
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import redirect_stdout
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -167,6 +168,13 @@ def test_a_seed_gives_the_same_pulses_in_memory_in_a_file_and_of_arrays(home, ru
     with pytest.warns(RejectionWarning):
         of_ren = run.ren.translate(sim.waveforms, energy_kev=sim.energy_kev, seed=4)
     assert np.array_equal(kept.waveforms, of_ren, equal_nan=True)
+
+
+def test_the_times_of_pulses_in_memory_are_carried_through(home, run):
+    sim = cpunet.open_pulses(home / "sim.lh5").read()[:3]
+    later = replace(sim, t0_ns=sim.t0_ns + 700.0)
+    before, after = (run.translate(of, noise=False).pulses.t0_ns for of in (sim, later))
+    np.testing.assert_allclose(after - before, 700.0)
 
 
 def test_histograms_and_figures_of_translated_pulses(home, run):
