@@ -62,9 +62,15 @@ NOISE_BINS = NOISE_SAMPLES // 2 + 1
 # of a run that was not trained
 FACTS = {"peak": "FEP", "seed": 0, "dt_ns": DT_NS, "seconds": 1.0, "device": "cpu"}
 LOSS_NAMES = (
-    "identity_data", "identity_sim", "cycle_forward", "cycle_backward",
-    "adversarial_ren", "adversarial_iren", "discriminator_data", "discriminator_sim",
-)  # fmt: skip
+    "identity_data",
+    "identity_sim",
+    "cycle_forward",
+    "cycle_backward",
+    "adversarial_ren",
+    "adversarial_iren",
+    "discriminator_data",
+    "discriminator_sim",
+)
 
 
 def of_parts(text: str) -> tuple[str, ...]:

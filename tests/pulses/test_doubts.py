@@ -19,7 +19,7 @@ from cpunet.pulses.provenance import (
     require_side,
     rolled_over,
     second_rate,
-)  # fmt: skip
+)
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter

@@ -132,8 +132,14 @@ class Rejection(IntEnum):
 
 # Numbers of a pulse; slopes are per sample.
 NUMBERS = (
-    "baseline", "scale", "align_sample", "baseline_rms", "baseline_slope", "tail_slope", "chi2",
-)  # fmt: skip
+    "baseline",
+    "scale",
+    "align_sample",
+    "baseline_rms",
+    "baseline_slope",
+    "tail_slope",
+    "chi2",
+)
 
 # The alignment moves the window of the baseline, and this the level at which it is searched.
 # Two rounds settle all but exact ties.

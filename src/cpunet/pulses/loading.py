@@ -317,10 +317,17 @@ def _read(
     if highest >= lowest and (first == first.round()).all():
         counts = int(lowest), int(highest)
     inputs = InputSet(
-        _joined(sets), source.dt_ns, source.path, energies[np.isfinite(energies)], recipe, None,
-        file.options, provenance.recorded_detector(source),
-        Baselines.concatenate(baselines) if measured else None, counts,
-    )  # fmt: skip
+        _joined(sets),
+        source.dt_ns,
+        source.path,
+        energies_kev=energies[np.isfinite(energies)],
+        recipe=recipe,
+        cuts=None,
+        read_as=file.options,
+        detector=provenance.recorded_detector(source),
+        baselines=Baselines.concatenate(baselines) if measured else None,
+        counts=counts,
+    )
     if not n:
         raise _nothing_left(inputs, selection, first, heights)
     if measured and not file.insist:

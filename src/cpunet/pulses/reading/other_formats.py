@@ -205,9 +205,16 @@ def read_flashcam(options: PulseFile) -> PulseSource:
 
     times = {"dt": Column.of(np.asarray(period_ns), "ns")} if period_ns > 0 else {}
     return PulseSource(
-        path, "FlashCam", name, None, length, rows, times=times,
-        of_each={"event_number": numbers}, close=stream.close,
-    )  # fmt: skip
+        path,
+        "FlashCam",
+        name,
+        None,
+        length,
+        rows,
+        times=times,
+        of_each={"event_number": numbers},
+        close=stream.close,
+    )
 
 
 def _events(

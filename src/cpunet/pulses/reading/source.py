@@ -490,6 +490,9 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             )
         t0_ns = of_each.get("t0_ns", 0.0)
         return Pulses.of(
-            waveforms, dt_ns=self.dt_ns, energy_kev=energy_kev, event_number=event_number,
+            waveforms,
+            dt_ns=self.dt_ns,
+            energy_kev=energy_kev,
+            event_number=event_number,
             t0_ns=t0_ns,
-        )  # fmt: skip
+        )
