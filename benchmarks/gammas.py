@@ -13,7 +13,7 @@ import numpy as np
 
 from cpunet.simulation.gammas import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.simulator import cluster_hits
+from cpunet.simulation.simulator import merge_hits
 
 N_EVENTS = 3_000
 DEP = {EnergyWindow("DEP", 1591.0, 1594.0): N_EVENTS}
@@ -46,9 +46,9 @@ def main() -> None:
     hits, gammas = source(n_primaries=10_000_000, wanted=DEP)
     spent = time.process_time() - start
     print(f"{gammas / spent:,.0f} gammas/s, {N_EVENTS / spent:,.0f} DEP events/s")
-    cluster_hits(hits[:10], 1.5)
+    merge_hits(hits[:10], 1.5)
     start = time.process_time()
-    sites = cluster_hits(hits, 1.5)
+    sites = merge_hits(hits, 1.5)
     spent = time.process_time() - start
     print(
         f"{len(hits) / spent:,.0f} events/s merged, "

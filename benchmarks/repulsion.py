@@ -21,13 +21,13 @@ from cpunet.kernels import kernel
 from cpunet.simulation.drift import (
     FWHM_PER_SIGMA,
     HOLE,
+    REPULSION_PER_KEV,
     carrier_velocity,
     cloud_after_step,
-    repulsion_constant,
     velocity_table,
 )
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.simulator import cluster_hits
+from cpunet.simulation.simulator import merge_hits
 
 Values = npt.NDArray[np.float64]
 ENERGIES_KEV = (100, 200, 400, 700, 1000, 1400, 2000)
@@ -96,10 +96,10 @@ def sigma(repulsion: Values) -> Values:
 
 def of_hits(places: Values, energy: Values, merging: float, near: float = 0.0) -> list[float]:
     """ln A by strength, of hits that repel with the energy within `near` mm, or their own."""
-    hits = cluster_hits(Hits.of(places, energy, [0, len(energy)]), merging)
+    hits = merge_hits(Hits.of(places, energy, [0, len(energy)]), merging)
     distance = np.linalg.norm(hits.position_mm[:, None] - hits.position_mm, axis=2)
     charge = (hits.edep_kev * (distance <= near)).sum(axis=1)
-    widths = [sigma(strength * repulsion_constant(1.0) * charge) for strength in STRENGTHS]
+    widths = [sigma(strength * REPULSION_PER_KEV * charge) for strength in STRENGTHS]
     return [log_amplitude(hits.z_mm, hits.edep_kev, width) for width in widths]
 
 

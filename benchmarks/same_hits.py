@@ -53,7 +53,7 @@ def main() -> None:
     detector = read_detector("icpc")
     settings = SimulationSettings(dt_ns=4, length_ns=2400)
     source = GammaSource({EnergyWindow("FEP", 2614.0, 2615.0): EVENTS}, 20.0, 5.0, 1)
-    hits = merge_hits(Hits.concatenate(list(source.open(detector).blocks)), detector, 0.05)
+    hits = merge_hits(Hits.concatenate(list(source.open(detector).blocks)), 0.05, detector)
     first = {}
     # the same events everywhere: those that lose less than 1 keV in the lithium layer
     kept = Simulator(detector, settings).events(hits).lost_kev < 1

@@ -33,7 +33,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulator import Simulator, cluster_hits
+from cpunet.simulation.simulator import Simulator, merge_hits
 from cpunet.translation.translator import REN
 
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
@@ -57,7 +57,7 @@ def run(*words: object) -> None:
 def events_of(path: Path, detector: str) -> Hits:
     """Events above 600 keV: their hits merged, those in the lithium left out."""
     hits = read_hits(path)
-    hits = cluster_hits(hits[np.flatnonzero(hits.energy_kev > 600)], 0.05)
+    hits = merge_hits(hits[np.flatnonzero(hits.energy_kev > 600)], 0.05)
     active = read_detector(detector).active(hits.r_mm, hits.z_mm)
     ends = np.append(0, np.cumsum(active))[hits.offsets]
     hits = Hits.of(hits.position_mm[active], hits.edep_kev[active], ends, hits.event_number)

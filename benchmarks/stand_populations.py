@@ -20,7 +20,7 @@ from cpunet.simulation.gammas import EnergyWindow
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import Shift, SimulationSettings
 from cpunet.simulation.simulate import GammaSource
-from cpunet.simulation.simulator import cluster_hits
+from cpunet.simulation.simulator import merge_hits
 
 FEP = EnergyWindow("FEP", 2609.511, 2619.511)
 NAMES = ("radius", "height", "spread in r", "spread in z", "sites", "largest site's share")
@@ -56,7 +56,7 @@ def events_of(side: Side) -> Values:
     for hits in side.source.open(side.detector).blocks:
         active = side.detector.active(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm)
         lost = np.add.reduceat(hits.edep_kev * ~active, hits.offsets[:-1])
-        sites = cluster_hits(hits[lost < LOST_KEV], SITE_MM)
+        sites = merge_hits(hits[lost < LOST_KEV], SITE_MM)
         begin, energy = sites.offsets[:-1], sites.edep_kev
         radius = np.hypot(sites.x_mm, sites.y_mm)
         total = np.add.reduceat(energy, begin)

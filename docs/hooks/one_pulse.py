@@ -37,7 +37,7 @@ def hits_of_an_event(detector: Detector) -> Hits:
         seed=1,
         wanted=wanted,
     )
-    hits = merge_hits(hits, detector, SimulationSettings().cluster_mm)
+    hits = merge_hits(hits, SimulationSettings().cluster_mm, detector)
     return hits[np.argsort(hits.event_number)[[EVENT]]]
 
 

@@ -42,7 +42,7 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch, other_c
     scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
     # scale and tilt add up to first order; the voltage is that of a grid
     for factor, more, error_V in ((0.9, 0.0, 3), (1.05, 0.0, 3), (1.1, 0.01, 15)):
-        voltage = solve(detector).depletion_V(factor * scale, tilt + more)
+        voltage = solve(detector).depletion(factor * scale, tilt + more)
         _, _, priors = freedom("impurity,tilt", [f"depletion_voltage={voltage}+-1"])
         known = depletion(physics, priors)
         assert known(np.array([np.log(factor), more]))[0] == pytest.approx(0, abs=error_V)
@@ -75,7 +75,7 @@ def test_a_parameter_that_explains_the_pulses_better_takes_the_place_of_another(
 )
 def test_a_detector_that_does_not_deplete_within_the_priors_is_refused(bias, given):
     detector = read_detector("ppc", ["grid_mm=0.25"])
-    depletes = solve(detector).depletion_V(detector.impurity_scale)
+    depletes = solve(detector).depletion(detector.impurity_scale)
     physics = Physics(
         detector.model_copy(update={"bias_V": bias * depletes}),
         SimulationSettings(),

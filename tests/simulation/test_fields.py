@@ -27,7 +27,7 @@ def no_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def same(one: FieldMaps, other: FieldMaps) -> bool:
-    names = vars(one).keys() - {"depletion"}
+    names = vars(one).keys() - {"impurity"}
     return one.depletion_V == other.depletion_V and all(
         np.array_equal(getattr(one, name), getattr(other, name)) for name in names
     )
@@ -163,7 +163,7 @@ def test_a_scale_may_deplete_impurities_that_no_bias_depletes() -> None:
     plain = read_detector("ppc", COARSE)
     many = {"impurity_z0_1e10_per_cm3": -32.0, "impurity_gradient_1e10_per_cm4": 3.2}
     same_sum = plain.model_copy(update=many | {"impurity_scale": 1 / 40})
-    assert solve(same_sum).depletion_V() == np.inf
+    assert solve(same_sum).depletion() == np.inf
     expected = compute_fields(plain).depletion_V
     assert compute_fields(same_sum).depletion_V == pytest.approx(expected, abs=1)
 

@@ -29,7 +29,7 @@ from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import detector_names, read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.outline import outline_of
-from cpunet.simulation.simulator import cluster_hits
+from cpunet.simulation.simulator import merge_hits
 
 
 def crystal(**changed: float) -> Detector:
@@ -87,7 +87,7 @@ def test_lines_and_spectrum_agree_with_geant4(reference_data: Path, height: int)
 @pytest.mark.thorough
 def test_sites_agree_with_geant4() -> None:
     hits, _ = run(20, 3_000_000, wanted=LINES)
-    sites = cluster_hits(hits, 1.5)
+    sites = merge_hits(hits, 1.5)
     count = np.bincount(sites.event_of_hit[sites.edep_kev > 5], minlength=len(sites))
     energy = hits.energy_kev
     dep, sep, fep = energy < 1600, (energy > 2100) & (energy < 2110), energy > 2610

@@ -68,7 +68,7 @@ def test_cylinders() -> None:
         total = 500 * found.bias[inside, row] + found.impurities[inside, row]
         np.testing.assert_allclose(total, expected, atol=0.05)
     wp = np.log(OUTER / r) / np.log(OUTER / INNER)
-    np.testing.assert_allclose(found.point_contact[inside, 5], wp, atol=3e-4)
+    np.testing.assert_allclose(found.weighting_potential[inside, 5], wp, atol=3e-4)
     e_r, e_z = electric_field(500 * found.bias + found.impurities, grid, mirror=True)
     log = (500 - CURVATURE / 4 * (OUTER**2 - INNER**2)) / np.log(OUTER / INNER)
     expected = -10 * (CURVATURE / 2 * r + log / r)
@@ -83,7 +83,7 @@ def test_cylinders() -> None:
     expected = CURVATURE / 4 * (OUTER**2 - INNER**2)
     expected -= CURVATURE / 2 * INNER**2 * np.log(OUTER / INNER)
     for potentials in (found, solve_potentials(detector, make_grid(Cylinders(**values(0.2))))):
-        assert potentials.depletion_V() == pytest.approx(expected, abs=20 * potentials.step_mm)
+        assert potentials.depletion() == pytest.approx(expected, abs=20 * potentials.grid_mm)
 
 
 def test_hemispheres_and_the_axis() -> None:
@@ -92,11 +92,11 @@ def test_hemispheres_and_the_axis() -> None:
     found = solve_potentials(detector, grid)
     rho = np.hypot(grid.r_mm[:, np.newaxis], grid.z_mm)[grid.free]
     wp = (1 / rho - 1 / OUTER) / (1 / INNER - 1 / OUTER)
-    np.testing.assert_allclose(found.point_contact[grid.free], wp, atol=3e-3)
+    np.testing.assert_allclose(found.weighting_potential[grid.free], wp, atol=3e-3)
     on_axis = grid.free[0]
     z = grid.z_mm[on_axis]
     wp = (1 / z - 1 / OUTER) / (1 / INNER - 1 / OUTER)
-    np.testing.assert_allclose(found.point_contact[0, on_axis], wp, atol=2e-3)
+    np.testing.assert_allclose(found.weighting_potential[0, on_axis], wp, atol=2e-3)
     # V = k rho^2 / 6 + c + d / rho, 0 on both
     k = CURVATURE / 6
     d = -k * (OUTER**2 - INNER**2) / (1 / OUTER - 1 / INNER)
@@ -109,7 +109,7 @@ def test_hemispheres_and_the_axis() -> None:
 def test_a_grounded_plane_takes_a_part_of_the_potential() -> None:
     grounded = Hemispheres(**values(0.2), vacuum_gap=1.0)
     found = solve_potentials(grounded, make_grid(grounded))
-    assert (found.point_contact + found.bias).min() < 1 - 1e-3
+    assert (found.weighting_potential + found.bias).min() < 1 - 1e-3
 
 
 def test_surface_charge_bends_the_potential_down() -> None:

@@ -149,7 +149,7 @@ def test_events_that_cannot_be_simulated(ppc, tmp_path: Path, given: dict[str, s
 def test_merging_keeps_energy_and_stops_at_the_lithium_layer(ppc):
     # ppc's layer is 1 mm below the top at 46 mm: z = 44.99 is active, 45.01 is not
     places = [[10, 0, 44.97], [10, 0, 45.01], [10, 0, 44.99], [10, 0, 20]]
-    merged = merge_hits(Hits.of(places, [100, 50, 300, 10], [0, 4, 4]), ppc, 0.05)
+    merged = merge_hits(Hits.of(places, [100, 50, 300, 10], [0, 4, 4]), 0.05, ppc)
     assert merged.edep_kev.tolist() == [400, 10, 50]
     assert merged.z_mm == pytest.approx([44.985, 20, 45.01])
     assert merged.offsets.tolist() == [0, 3, 3]

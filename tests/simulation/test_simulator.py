@@ -18,7 +18,7 @@ from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
-from cpunet.simulation.simulator import Simulator, cluster_hits
+from cpunet.simulation.simulator import Simulator, merge_hits
 
 PLAIN = SimulationSettings(dt_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0)
 SIGGEN = PLAIN.model_copy(
@@ -279,7 +279,7 @@ def test_the_same_as_single_linkage(n: int, seed: int, distance: float) -> None:
     hits = event_of(n, seed)
     label = fcluster(linkage(hits.position_mm), distance, criterion="distance")
     truth = np.sort(np.bincount(label, weights=hits.edep_kev)[1:])
-    np.testing.assert_allclose(np.sort(cluster_hits(hits, distance).edep_kev), truth)
+    np.testing.assert_allclose(np.sort(merge_hits(hits, distance).edep_kev), truth)
 
 
 @given(st.lists(st.integers(0, 12), max_size=6), st.floats(0, 50))
@@ -287,7 +287,7 @@ def test_energy_and_centre_of_each_event_stay(counts: list[int], distance: float
     hits = Hits.concatenate(
         [Hits.of([], [], [0]), *(event_of(n, seed) for seed, n in enumerate(counts))]
     )
-    merged = cluster_hits(hits, distance)
+    merged = merge_hits(hits, distance)
     np.testing.assert_allclose(merged.energy_kev, hits.energy_kev, rtol=1e-12)
     for axis in ("x_mm", "y_mm", "z_mm"):
         before, after = (

@@ -139,9 +139,8 @@ class CalibratedPhysics(InfoPart):
         Of all that is compared.
     covariance
         Of the coordinates of the free parameters, in their order.
-    functions, groups, pulls_before, pulls_after
-        Names of the functions, how many of them each group has, and their deviations in
-        standard deviations.
+    groups, pulls_before, pulls_after
+        How many functions each group has, and their deviations in standard deviations.
     rounds, settled
         Number of rounds, and whether the physics was unchanged in the last.
     notes
@@ -155,7 +154,6 @@ class CalibratedPhysics(InfoPart):
     directions: list[Direction]
     chi_square: ChiSquare
     covariance: list[list[float]]
-    functions: list[str]
     groups: dict[str, int]
     pulls_before: list[float]
     pulls_after: list[float]
@@ -165,11 +163,8 @@ class CalibratedPhysics(InfoPart):
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """``pulls``, and ``directions`` if any parameter was free."""
-        drawn = {"pulls": pulls_figure(self)}
-        if self.directions:
-            drawn["directions"] = directions_figure(self.directions)
-        return drawn
+        """``pulls`` and ``directions``."""
+        return {"pulls": pulls_figure(self), "directions": directions_figure(self.directions)}
 
     @property
     def comment(self) -> str:
@@ -272,7 +267,7 @@ class Calibration(Run):
 
     @property
     def figures(self) -> dict[str, Figure]:
-        """``pulls``, and ``directions`` if any parameter was free."""
+        """``pulls`` and ``directions``."""
         return self.result.figures
 
     def __str__(self) -> str:
@@ -366,8 +361,8 @@ def pulls_figure(result: CalibratedPhysics) -> Figure:
     """Pulls of all functions before and after a calibration."""
     figure = Figure(figsize=(9.5, 3.6))
     panel = figure.subplots()
-    x = np.arange(len(result.functions))
     before, after = result.pulls_before, result.pulls_after
+    x = np.arange(len(after))
     panel.plot(x, before, ".", ms=4, color=BEFORE, label="as simulated, chain alone")
     panel.plot(x, after, ".", ms=4, color=AFTER, label="calibrated")
     panel.set_yscale("symlog", linthresh=LINEAR)

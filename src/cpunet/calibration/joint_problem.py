@@ -78,30 +78,21 @@ class SlicedJoint(Joint):
             self._bands.append((centres, wider * np.maximum(factor * between, least)))
 
     @property
-    def names(self) -> dict[str, list[str]]:
-        """Names of the functions by group, both beginning with the band of several."""
-        times, n = np.array_split(self.sides.time_ns, SEGMENTS), self.matrix.shape[1] - SEGMENTS
-        components = [f"component {i}" for i in range(n, 0, -1)]
-        bins = [f"current amplitude, bin {k + 1}" for k in range(len(self.places))]
-        products = [f"{c}, {bin_}" for bin_ in bins if self.products for c in components]
-        density, slices, amplitudes = (range(1, len(c) + 1) for c, _ in self._bands)
-        sliced = [f"component {c}" for c in range(2, OTHERS + 2)]
-        several = [f"current amplitude, bin {j}" for j in amplitudes]
-        groups = {
-            "samples": [f"samples about {t[len(t) // 2]:.0f} ns" for t in times],
+    def groups(self) -> dict[str, int]:
+        """Numbers of functions by group, in order; names begin with the band of several."""
+        components, bins = self.matrix.shape[1] - SEGMENTS, len(self.places)
+        times, slices, amplitudes = (len(centres) for centres, _ in self._bands)
+        numbers = {
+            "samples": SEGMENTS,
             "components": components,
             "current amplitude": bins,
-            "components with current amplitude": products,
-            "drift time": [f"drift time, bin {k}" for k in density],
-            "components in slices": [f"{c}, slice {k}" for c in sliced for k in slices],
-            "current amplitude in slices": [f"{b}, slice {k}" for b in several for k in slices],
+            "components with current amplitude": components * bins * self.products,
+            "drift time": times,
+            "components in slices": OTHERS * slices,
+            "current amplitude in slices": amplitudes * slices,
         }
         band = f"{self.band}: " if self.band else ""
-        return {
-            f"{band}{of}": [f"{band}{name}" for name in own]
-            for of, own in groups.items()
-            if own
-        }
+        return {f"{band}{group}": number for group, number in numbers.items() if number}
 
     def _functions(self, pulses: Aligned) -> Values:
         shape = self._shape(pulses)

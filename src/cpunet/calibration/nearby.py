@@ -49,6 +49,7 @@ def move(pulses: FloatArray, samples: Values) -> FloatArray:
     return between(stretch(pulses, whole - 1, pulses.shape[1] + 3), weights)
 
 
+@dataclass(eq=False)
 class Simulator:
     """Simulation of events as a function of the coordinates of the physics.
 
@@ -58,21 +59,19 @@ class Simulator:
         Merged hits of the events, in an order in which any first part is representative.
     physics
         Detector and parameters that the coordinates refer to.
-
-    Attributes
-    ----------
-    simulated : callable
+    simulated
         Called after each simulation.
-    finer : int
-        Number of fine samples per sample.
     """
 
-    def __init__(self, hits: Hits, physics: Physics) -> None:
-        self.physics = physics
-        self.simulated: Callable[[], None] = lambda: None
-        self._hits = hits
-        steps = physics.settings.dt_ns / physics.settings.step_ns
-        self.finer = next(n for n in FINER if abs(steps / n - round(steps / n)) < 1e-9)
+    hits: Hits
+    physics: Physics
+    simulated: Callable[[], None] = lambda: None
+
+    @property
+    def finer(self) -> int:
+        """Number of fine samples per sample."""
+        steps = self.physics.settings.dt_ns / self.physics.settings.step_ns
+        return next(n for n in FINER if abs(steps / n - round(steps / n)) < 1e-9)
 
     def __call__(
         self, coordinates: Values, *, quick: bool = False, most: int | None = None
@@ -84,7 +83,7 @@ class Simulator:
         detector, settings = self.physics.at(coordinates)
         if quick:
             settings = settings.model_copy(update={"dt_ns": settings.dt_ns / self.finer})
-        events = DetectorSimulator(detector, settings, quick=quick).events(self._hits[:most])
+        events = DetectorSimulator(detector, settings, quick=quick).events(self.hits[:most])
         self.simulated()
         return events.waveforms
 

@@ -6,13 +6,14 @@ import math
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.settings import checked
+from cpunet.settings import Config, checked, read_values
 from cpunet.simulation.fields import solve
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
@@ -20,8 +21,7 @@ from cpunet.simulation.settings import SimulationSettings
 Values = npt.NDArray[np.float64]
 
 
-@dataclass(frozen=True)
-class Nuisance:
+class Nuisance(Config):
     r"""A parameter of the physics, and how far it may be from its simulated value.
 
     The fit uses a coordinate :math:`x` that is 0 at the simulated value :math:`p_0`. The
@@ -107,59 +107,8 @@ _SCALES: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = 
 }
 # Parameters that are uncertain for any detector come first and are considered first. The others
 # are used only if these do not explain the data.
-NUISANCES = (
-    Nuisance(
-        "temperature_K", "temperature", "added", "[K]", 3.0, 0.5, 1.5, 40, 120,
-        "sensors sit next to crystals, not in them", first=True,
-    ),
-    Nuisance(
-        "impurity_factor", "impurity", "factor", "(factor)", 0.1, 0.01, 0.03, 1e-3, 1e3,
-        "what a depletion voltage tells of it (Hall probes: 30 %)",
-        first=True,
-    ),
-    Nuisance(
-        "self_repulsion", "self_repulsion", "added", "(factor)", 1.0, 0.3, 0.9, 0, 10,
-        "none or all of what a model of the cloud gives", first=True, possible=(0, 2),
-    ),
-    Nuisance(
-        "diffusion_constant", "diffusion", "added", "[V mm/cm]", 0.03, 0.01, 0.03, 1e-3, 1,
-        "0.066 to 0.12 V mm/cm: kT/e, and what was measured", first=True, possible=(0.06, 0.13),
-    ),
-    Nuisance(
-        "cloud_fwhm_mm", "cloud", "square", "[mm]", 0.1, 0.03, 0.1, 0, 5,
-        "0.1 to 0.6 mm: ranges of electrons", first=True, possible=(0, 1),
-    ),
-    Nuisance(
-        "impurity_tilt_1e10_per_cm4", "tilt", "added", "[10¹⁰/cm⁴]", 0.03, 0.005, 0.02, -10, 10,
-        "30 % of a gradient of 1e9 per cm4",
-    ),
-    *(
-        Nuisance(
-            f"{name}_factor", name, "factor", "(factor)", 0.1, step, reach, 0.25, 4,
-            "published mobilities differ by 10 to 20 % (Reggiani et al. 1977, Bruyneel et al. "
-            "2016)",
-        )
-        for name, step, reach in (
-            ("hole_velocity_low", 0.01, 0.03), ("hole_velocity_high", 0.02, 0.05),
-            ("electron_velocity_low", 0.02, 0.1), ("electron_velocity_high", 0.02, 0.1),
-        )
-    ),
-    *(
-        Nuisance(
-            f"{name}_per_us", name, "added", "[1/µs]", 0.01, 0.005, 0.03, 0, 10,
-            "0 to 1 % per us",
-        )
-        for name in ("hole_trapping", "electron_trapping")
-    ),
-    Nuisance(
-        "bias_V", "bias", "added", "[V]", 5.0, 20.0, 60.0, 10, 2e4,
-        "what high-voltage modules are calibrated to",
-    ),
-    Nuisance(
-        "li_thickness_mm", "li_thickness", "added", "[mm]", 0.2, 0.1, 0.3, 0.01, 5,
-        "what a full-charge collection depth is measured to", field="li_thickness",
-    ),
-)  # fmt: skip
+_TABLE: dict[str, dict[str, Any]] = read_values(Path(__file__).with_name("nuisances.yaml"))
+NUISANCES = tuple(Nuisance(name=name, **row) for name, row in _TABLE.items())
 
 
 def titled(text: str, *, units: bool = True) -> str:
@@ -214,14 +163,10 @@ class Physics:
 
     def nominal(self, nuisance: Nuisance) -> float:
         """Simulated value; 1 for a factor that is not in the settings."""
-        if nuisance.name == "impurity_factor":
-            return 1.0
-        value = {**dict(self.settings), **dict(self.detector)}[nuisance.field or nuisance.name]
-        if value == "siggen":
-            return 0.12
-        if value == "temperature":
-            return 8.617333e-4 * self.detector.temperature_K
-        return float(value)
+        values = {**dict(self.settings), **dict(self.detector), "impurity_scale": 1.0}
+        value = values[nuisance.field or nuisance.name]
+        of_words = {"siggen": 0.12, "temperature": 8.617333e-4 * self.detector.temperature_K}
+        return float(of_words.get(value, value))
 
     def values(self, coordinates: Values) -> dict[str, float]:
         """Values by name."""
@@ -242,10 +187,10 @@ class Physics:
         values = self.values(coordinates)
         for n, coordinate in zip(self.nuisances, coordinates, strict=True):
             field = n.field or n.name
-            if coordinate and n.name == "impurity_factor":
-                of_detector["impurity_scale"] *= values[n.name]
-            elif coordinate:
-                (of_detector if field in of_detector else of_settings)[field] = values[n.name]
+            fields = of_detector if field in of_detector else of_settings
+            if coordinate:
+                unit = fields[field] if n.name == "impurity_factor" else 1.0
+                fields[field] = unit * values[n.name]
         sizes = ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
         remedy = "narrow a `prior`, or leave any of them out of `free`"
         source = f"detector {self.detector.name}: {sizes} is impossible; {remedy}"
@@ -358,13 +303,14 @@ def depletion(
     """
     centres, _ = physics.priors(given)
     higher = np.array([(x.name == "impurity_factor") * x.step for x in physics.nuisances])
-    measured, needed, bias = given.get(DEPLETION), [], physics.detector.bias_V
-    for coordinates in (np.zeros(len(centres)), higher, centres):
+    measured, bias = given.get(DEPLETION), physics.detector.bias_V
+    needed = [] if measured is None else [measured[0]]
+    for coordinates in (higher, centres, np.zeros(len(centres))):
         detector, _ = physics.at(coordinates)
         scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
-        needed.append(solve(detector).depletion_V(scale, tilt) + bias - detector.bias_V)
-    if measured is not None:
-        needed.append(measured[0])
+        superposition = solve(detector)
+        at_first = superposition.depletion(scale, tilt)
+        needed.append(at_first + bias - detector.bias_V)
     if max(needed) > bias:
         raise CpunetError(
             f"detector {physics.detector.name}: within the priors it depletes at "
@@ -375,12 +321,9 @@ def depletion(
     if measured is None:
         return lambda _: np.empty(0)
     wanted, error = measured
-    superposition, detector = solve(physics.detector), physics.detector
-    scale, tilt = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
-    at_first = superposition.depletion_V(scale, tilt)
     # the factor scales neither a tilt nor a surface charge, so the voltage is not proportional
-    scaled = superposition.depletion_V((1 + _FACTOR) * scale, tilt)
-    tilted = superposition.depletion_V(scale, tilt + _TILT)
+    scaled = superposition.depletion((1 + _FACTOR) * scale, tilt)
+    tilted = superposition.depletion(scale, tilt + _TILT)
     with_factor, with_tilt = (scaled - at_first) / _FACTOR, (tilted - at_first) / _TILT
 
     def deviation(coordinates: Values) -> Values:

@@ -16,7 +16,6 @@ Phys. Rev. D 88 (2013) 063537; Percival et al., MNRAS 439 (2014) 2531).
 
 from __future__ import annotations
 
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -130,7 +129,6 @@ def described(
         if best and falls[best] > NOTABLE:
             rest = f"with {best} free, too, it would fall by {falls[best]:.0f}"
         text = f"a poor fit (expected from statistics: {mean:.2f} ± {spread:.2f}); {rest}"
-    groups = {group: names for of in problem.functions for group, names in of.names.items()}
     widths = problem.widths[n:]
     return CalibratedPhysics(
         parameters=free,
@@ -139,8 +137,7 @@ def described(
         directions=linear.directions([nuisance.name for nuisance in physics.nuisances]),
         chi_square=chi,
         covariance=covariance[n:, n:].tolist(),
-        functions=[*chain.from_iterable(groups.values())],
-        groups={group: len(names) for group, names in groups.items()},
+        groups={group: n for of in problem.functions for group, n in of.groups.items()},
         notes=[*notes, f"chi-square is {per:.2f} per function, {text}"],
         **facts,
     )

@@ -25,7 +25,6 @@ from importlib.resources import files
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.integrate import cumulative_trapezoid
 from scipy.interpolate import RectBivariateSpline
 
@@ -73,7 +72,11 @@ def velocity_table(
     temperature_K
         Crystal temperature in K.
     settings
-        Their velocity factors, common to all axes, are applied, see `velocity_factor`.
+        Their velocity factors, common to all axes, are applied: :math:`f_l` up to 250 V/cm,
+        :math:`f_h` from 1000 V/cm, and between these
+
+        .. math:: f = f_l + (f_h - f_l)\, x^2 (3 - 2x), \qquad
+            x = \frac{\ln(E / 250\ \mathrm{V/cm})}{\ln 4}.
 
     Returns
     -------
@@ -110,8 +113,11 @@ def velocity_table(
             speeds.append(saturation * x / np.sqrt(1 + x**2))
         now, then = speeds
         factor = np.divide(now, then, out=np.ones_like(field), where=then > 0)
-        ends = (getattr(settings, f"{name}_velocity_{end}_factor") for end in ("low", "high"))
-        factor = factor * velocity_factor(field, *ends)
+        low = getattr(settings, f"{name}_velocity_low_factor")
+        high = getattr(settings, f"{name}_velocity_high_factor")
+        x = np.log(np.clip(field, _LOW_FIELD, _HIGH_FIELD) / _LOW_FIELD)
+        x /= math.log(_HIGH_FIELD / _LOW_FIELD)
+        factor = factor * (low + (high - low) * x * x * (3 - 2 * x))
         v100, v110, v111 = (measured[:, 1 + 3 * carrier : 4 + 3 * carrier] * factor[:, None]).T
         a = v100 / 2 - 4 * v110 + 4.5 * v111
         b = -2.5 * v100 + 16 * v110 - 13.5 * v111
@@ -123,22 +129,6 @@ def velocity_table(
         columns = (a, b, c, *means, v100)
         tables.append(np.stack([np.interp(grid, field, column) for column in columns], 1))
     return np.ascontiguousarray(tables), 1 / step
-
-
-def velocity_factor(field_V_per_cm: npt.ArrayLike, low: float, high: float) -> FloatArray:
-    r"""Speed factor: `low` up to 250 V/cm, `high` from 1000 V/cm.
-
-    .. math:: f = f_l + (f_h - f_l)\, x^2 (3 - 2x), \qquad
-        x = \frac{\ln(E / 250\ \mathrm{V/cm})}{\ln 4} \in [0, 1]
-
-    Examples
-    --------
-    >>> velocity_factor([100, 500, 2000], 0.9, 1.1).round(3)
-    array([0.9, 1. , 1.1])
-    """
-    field = np.clip(np.asarray(field_V_per_cm, np.float64), _LOW_FIELD, _HIGH_FIELD)
-    x = np.log(field / _LOW_FIELD) / math.log(_HIGH_FIELD / _LOW_FIELD)
-    return np.asarray(low + (high - low) * x * x * (3 - 2 * x), np.float64)
 
 
 @kernel(inline="always")
@@ -336,73 +326,15 @@ def in_active_volume(maps: DriftMaps, x: float, y: float, z: float) -> bool:
 
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
-# siggen's rounded value, used in its formulas
-_SIGGEN_FWHM_PER_SIGMA = 2.355
 # 2.355**2 times 0.12 V mm/cm, as rounded in siggen
-_SIGGEN_DIFFUSION = 0.67
-_BOLTZMANN_V_PER_K = 8.617333e-5
-SMALLEST_FWHM_MM = 0.01
-"""Initial FWHM of a cloud that grows, at least."""
+SIGGEN_DIFFUSION = 0.67
+BOLTZMANN_V_PER_K = 8.617333e-5
+# siggen's self-repulsion of a cloud of 1 keV: 0.003 keV per electron-hole pair, a relative
+# permittivity of 16, and its rounded FWHM per sigma
+REPULSION_PER_KEV = 1.0 / 0.003 / 6.241e18 * 0.67**3 * 9e13 / 16 * 2.355**3
+SMALLEST_FWHM_MM = 0.01  # initial FWHM of a cloud that grows, at least
 _MAX_REPULSION = 0.05
 _CUT_FWHM = 2.0
-
-
-def diffusion_constant(chosen: float | str, temperature_K: float) -> float:
-    r"""Diffusion constant of the cloud in units of v/E: mm2/ns over (mm/ns)/(V/cm).
-
-    The FWHM :math:`s` of a diffusing Gaussian cloud follows
-
-    .. math:: \frac{ds^2}{dt} = 2\, D_s, \qquad D_s = 8 \ln 2 \cdot D, \qquad
-        \frac{D}{v/E} = \frac{kT}{e} \quad \mathrm{(Einstein)},
-
-    and the function returns :math:`D_s / (v/E)`.
-
-    Parameters
-    ----------
-    chosen
-        D/(v/E) in V mm/cm, ``"temperature"`` (Einstein relation, kT/e) or ``"siggen"``; see
-        `cpunet.simulation.settings.SimulationSettings`.
-    temperature_K
-        Crystal temperature in K.
-
-    Examples
-    --------
-    At 90 K, kT/e is 7.76 mV, or 0.0776 V mm/cm.
-
-    >>> round(diffusion_constant("temperature", 90.0) / FWHM_PER_SIGMA**2, 4)
-    0.0776
-    """
-    if chosen == "siggen":
-        return _SIGGEN_DIFFUSION
-    if chosen == "temperature":
-        chosen = _BOLTZMANN_V_PER_K * temperature_K * 10.0
-    return FWHM_PER_SIGMA**2 * float(chosen)
-
-
-def repulsion_constant(energy_kev: float) -> float:
-    r"""Self-repulsion constant :math:`K` of siggen.
-
-    .. math:: \frac{ds}{dt} = \frac{K}{s^2} \frac{dv}{dE}
-
-    with the FWHM :math:`s` in mm. :math:`K` is proportional to the charge of the cloud, with
-    0.003 keV per electron-hole pair and a relative permittivity of 16.
-
-    Parameters
-    ----------
-    energy_kev
-        Energy deposit in keV.
-
-    References
-    ----------
-    D. C. Radford, siggen.
-
-    Examples
-    --------
-    >>> bool(repulsion_constant(2000.0) == 2 * repulsion_constant(1000.0))
-    True
-    """
-    charge = energy_kev / 0.003 / 6.241e18
-    return charge * 0.67**3 * 9e13 / 16 * _SIGGEN_FWHM_PER_SIGMA**3
 
 
 @kernel(inline="always")
@@ -419,13 +351,18 @@ def cloud_after_step(
 ) -> float:
     r"""FWHM (mm) of the cloud after one step.
 
-    The cloud is stretched in proportion to the speed, then grows by diffusion and repulsion,
+    The cloud is stretched in proportion to the speed, then grows by diffusion and by siggen's
+    self-repulsion. For its FWHM :math:`s`
 
-    .. math:: \frac{ds}{dt} = \frac{D}{s} + R.
+    .. math:: \frac{ds}{dt} = \frac{D_s}{s} + \frac{K}{s^2} \frac{dv}{dE}, \qquad
+        D_s = 8 \ln 2 \cdot D.
+
+    `diffusion` is :math:`D_s / (v/E)`, `repulsion` is :math:`K`, proportional to the charge.
 
     Large steps of a small cloud, which would overshoot, are integrated in powers of s,
 
-    .. math:: s_{k+1}^2 = 2 D\, \Delta t + \left[s_k^2 (s_k + 3 R\, \Delta t)\right]^{2/3}.
+    .. math:: s_{k+1}^2 = 2 D_s\, \Delta t + \left[s_k^2 (s_k + 3 R\, \Delta t)\right]^{2/3},
+        \qquad R = \frac{K}{s_k^2} \frac{dv}{dE}.
     """
     if diffusion == 0.0 and repulsion == 0.0:
         return size

@@ -20,7 +20,6 @@ import functools
 import logging
 import math
 import os
-from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -34,7 +33,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import written_aside
 from cpunet.progress import stage
 from cpunet.pulses.reading.other_formats import read_arrays
-from cpunet.simulation.geometry import Detector, FloatArray, RegionArray
+from cpunet.simulation.geometry import Detector, FloatArray
 from cpunet.simulation.outline import DITCH, GERMANIUM, LI_CONTACT
 from cpunet.simulation.poisson import (
     HIGHEST_BIAS_V,
@@ -49,7 +48,7 @@ from cpunet.simulation.poisson import (
 log = logging.getLogger(__name__)
 
 # part of the file name, so that results of an older solver are not used
-SOLVER_VERSION = 4
+SOLVER_VERSION = 5
 
 
 # fields that do not affect the parts of the potential, and values in their place
@@ -106,24 +105,18 @@ _V_PER_CM = 10.0  # of 1 V / mm
 
 
 @dataclass(frozen=True, eq=False)
-class FieldMaps:
-    """Fields at the nodes ``r_mm`` (nr) times ``z_mm`` (nz), spaced by `grid_mm`.
+class FieldMaps(Potentials):
+    """Fields at the nodes of the parts of the potential, for a bias and impurities.
 
     Maps have shape (nr, nz). The field is E = -grad V in V/cm. It is 0 in contacts and
-    outside; on the walls of the ditch it is that of the germanium. `region` is
-    `Detector.region` at the nodes. `depletion` gives the depletion voltage in V.
+    outside; on the walls of the ditch it is that of the germanium. `impurity` is the scale and
+    the tilt of the impurities.
     """
 
-    r_mm: FloatArray
-    z_mm: FloatArray
-    grid_mm: float
     potential_V: FloatArray
     e_r_V_per_cm: FloatArray
     e_z_V_per_cm: FloatArray
-    weighting_potential: FloatArray
-    region: RegionArray
-    capacitance_pF: float
-    depletion: Callable[[], float]
+    impurity: tuple[float, float]
 
     @functools.cached_property
     def depletion_V(self) -> float:
@@ -131,7 +124,7 @@ class FieldMaps:
 
         With tilted impurities or a surface charge this takes longer than all maps.
         """
-        return self.depletion()
+        return self.depletion(*self.impurity)
 
 
 def compute_fields(detector: Detector) -> FieldMaps:
@@ -143,33 +136,27 @@ def compute_fields(detector: Detector) -> FieldMaps:
         If the detector is not fully depleted, or the grid is too fine.
     """
     parts, bias = solve(detector), detector.bias_V
-    impurities = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
-    potential = parts.total_V(bias, *impurities)
-    depletion = functools.partial(parts.depletion_V, *impurities)
+    impurity = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
+    potential = parts.total_V(bias, *impurity)
     if has_pocket(potential, parts.region):
-        if depletion() == math.inf:
+        if (needed := parts.depletion(*impurity)) == math.inf:
             raise CpunetError(
                 f"detector {detector.name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
                 "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
             )
         raise CpunetError(
             f"detector {detector.name}: bias_V = {bias:g} does not deplete it; "
-            f"give at least the depletion voltage, {np.ceil(depletion()):.0f} V"
+            f"give at least the depletion voltage, {np.ceil(needed):.0f} V"
         )
     # without a charge or a plane below it, the field has no component normal to the face z = 0
     mirror = not (detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
     e_r, e_z = electric_field(potential, parts, mirror=mirror)
     return FieldMaps(
-        r_mm=parts.r_mm,
-        z_mm=parts.z_mm,
-        grid_mm=parts.step_mm,
+        **vars(parts),
         potential_V=potential,
         e_r_V_per_cm=e_r,
         e_z_V_per_cm=e_z,
-        weighting_potential=parts.point_contact,
-        region=parts.region,
-        capacitance_pF=parts.capacitance_pF,
-        depletion=depletion,
+        impurity=impurity,
     )
 
 
@@ -234,7 +221,7 @@ def electric_field(
     --------
     A potential of 100 V/mm along z is a field of -1000 V/cm.
 
-    >>> nodes = Grid(r_mm=np.arange(3.0), z_mm=np.arange(4.0), step_mm=1.0,
+    >>> nodes = Grid(r_mm=np.arange(3.0), z_mm=np.arange(4.0), grid_mm=1.0,
     ...     region=np.full((3, 4), 2, np.int8), r_steps=np.ones((2, 4)),
     ...     z_steps=np.ones((3, 3)))
     >>> e_r, e_z = electric_field(np.tile(100 * nodes.z_mm, (3, 1)), nodes, mirror=False)
@@ -249,8 +236,8 @@ def electric_field(
         # the parabola through a node and its neighbours; across a wall of the ditch the slope
         # jumps: only the germanium side counts
         ditch = region == DITCH
-        rise = np.diff(volts, axis=0) / (steps * grid.step_mm)
-        weight = np.where(ditch[:-1] & ditch[1:], 1e-9, 1.0) / (steps * grid.step_mm)
+        rise = np.diff(volts, axis=0) / (steps * grid.grid_mm)
+        weight = np.where(ditch[:-1] & ditch[1:], 1e-9, 1.0) / (steps * grid.grid_mm)
         slope = on_nodes(weight * rise, weight * rise, axis=0) / on_nodes(
             weight, weight, axis=0
         )

@@ -24,32 +24,25 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from scipy.optimize import brentq
 
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
-from cpunet.simulation.geometry import Detector
+from cpunet.simulation.geometry import Detector, FloatArray, IntArray
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.outline import Outline, in_germanium, outline_of
 
 log = logging.getLogger(__name__)
 
-Array = npt.NDArray[np.float64]
-Integers = npt.NDArray[np.int64]
-
+# maximum numbers of hits and of photons per event; Tl-208 gives about 200 hits
 MAX_HITS, MAX_PHOTONS = 2000, 256
-"""Maximum numbers of hits and of photons per event; Tl-208 gives about 200 hits."""
 TL208_KEV = 2614.511
-"""Energy of the gamma line of Tl-208 in keV."""
-ELECTRON_MASS = 0.510998950
-"""Electron mass in MeV."""
-K_BINDING = 0.0111031
-"""Binding energy of the K shell in MeV."""
+ELECTRON_MASS = 0.510998950  # MeV
+K_BINDING = 0.0111031  # of the K shell, MeV
+# photons below this energy (MeV) are absorbed locally: their path is < 0.1 mm
 PHOTON_CUT = 0.010
-"""Photons below this energy (MeV) are absorbed locally: their path is < 0.1 mm."""
+# electrons below this energy (MeV) stop locally: their range is < 0.01 mm
 ELECTRON_CUT = 0.030
-"""Electrons below this energy (MeV) stop locally: their range is < 0.01 mm."""
 
 _TOP = 2.7
 _LOSS_PER_STEP = 0.12
@@ -69,9 +62,9 @@ class PhotonTable(NamedTuple):
 
     log_first: float
     per_log: float
-    attenuation_per_mm: Array
-    photoelectric: Array
-    not_pair: Array
+    attenuation_per_mm: FloatArray
+    photoelectric: FloatArray
+    not_pair: FloatArray
 
 
 class ElectronTable(NamedTuple):
@@ -84,13 +77,13 @@ class ElectronTable(NamedTuple):
     energy of the hard photon relative to that of the electron.
     """
 
-    energy: Array
-    step: Array
-    scattering: Array
-    scattering_cut: Array
-    brems: Array
-    annihilation: Array
-    photon_share: Array
+    energy: FloatArray
+    step: FloatArray
+    scattering: FloatArray
+    scattering_cut: FloatArray
+    brems: FloatArray
+    annihilation: FloatArray
+    photon_share: FloatArray
 
 
 @functools.cache
@@ -127,10 +120,21 @@ def electron_table() -> ElectronTable:
     rows = int(np.ceil(np.log(ELECTRON_CUT / 4 / _TOP) / np.log(ratio)))
     energy = np.asarray(_TOP * ratio ** np.arange(rows), np.float64)
     middle = energy * np.sqrt(ratio)
-    # to collisions, and to photons below the cut
+    momentum = np.sqrt(middle * (middle + 2 * ELECTRON_MASS))
+    beta = momentum / (middle + ELECTRON_MASS)
+    gamma = 1 + middle / ELECTRON_MASS
+    root = np.sqrt(gamma**2 - 1)
+    # stopping power of collisions in MeV/mm, and of photons below the cut
+    s, x, tau, beta2 = _STERNHEIMER, np.log10(root), gamma - 1, 1 - gamma**-2
+    bend = s["a"] * np.clip(s["x1"] - x, 0, None) ** s["m"]
+    density = np.where(x < s["x0"], 0.0, 2 * np.log(10) * x - s["c"] + bend)
+    form = 1 - beta2 + (tau**2 / 8 - (2 * tau + 1) * np.log(2)) / gamma**2
+    logarithm = np.log(tau**2 * (tau + 2) / (2 * (_EXCITATION / ELECTRON_MASS) ** 2))
+    scale = 2 * np.pi * _RADIUS**2 * ELECTRON_MASS * _ATOMS * _Z / 10
+    collisions = scale / beta2 * (logarithm + form - density)
     most = np.minimum(middle, PHOTON_CUT)
     soft = _radiation(middle[:, np.newaxis], (np.arange(32) + 0.5) / 32 * most[:, np.newaxis])
-    step = energy * _LOSS_PER_STEP / (_collision_loss(middle) + soft.mean(axis=1) * most)
+    step = energy * _LOSS_PER_STEP / (collisions + soft.mean(axis=1) * most)
     # photons above the cut: number per mm, and quantiles of their energy fraction k/T
     hard, quantiles = np.zeros(rows), np.ones((rows, _BREMS_NODES))
     for i in np.flatnonzero(middle > PHOTON_CUT):
@@ -141,8 +145,6 @@ def electron_table() -> ElectronTable:
         quantiles[i] = np.exp(np.interp(wanted, cumulative, log)) / middle[i]
         hard[i] = np.trapezoid(density, log)
     # inverse of the first transport mean free path: -d<cos>/ds at s = 0
-    momentum = np.sqrt(middle * (middle + 2 * ELECTRON_MASS))
-    beta = momentum / (middle + ELECTRON_MASS)
     angle = _ALPHA * ELECTRON_MASS / momentum * _Z ** (1 / 3) / 0.885
     screening = angle**2 / 4 * (1.13 + 3.76 * (_ALPHA * _Z / beta) ** 2)
     size = 2 * np.pi * _RADIUS**2 * _Z * (_Z + 1) * (ELECTRON_MASS / (momentum * beta)) ** 2
@@ -153,8 +155,6 @@ def electron_table() -> ElectronTable:
         [brentq(lambda b, m=m: b - 2 / np.expm1(2 / b) - m, 3e-3, 1e4) for m in turned]
     )
     # of positrons in flight, per mm
-    gamma = 1 + middle / ELECTRON_MASS
-    root = np.sqrt(gamma**2 - 1)
     bracket = (gamma**2 + 4 * gamma + 1) / root**2 * np.log(gamma + root) - (gamma + 3) / root
     annihilation = np.pi * _RADIUS**2 / (gamma + 1) * bracket * _ATOMS * _Z / 10
     return ElectronTable(
@@ -168,22 +168,7 @@ def electron_table() -> ElectronTable:
     )
 
 
-def _collision_loss(kinetic: Array) -> Array:
-    """Collision stopping power in MeV/mm."""
-    gamma = 1 + kinetic / ELECTRON_MASS
-    tau = gamma - 1
-    beta2 = 1 - gamma**-2
-    x = np.log10(np.sqrt(gamma**2 - 1))
-    s = _STERNHEIMER
-    bend = s["a"] * np.clip(s["x1"] - x, 0, None) ** s["m"]
-    density = np.where(x < s["x0"], 0.0, 2 * np.log(10) * x - s["c"] + bend)
-    form = 1 - beta2 + (tau**2 / 8 - (2 * tau + 1) * np.log(2)) / gamma**2
-    logarithm = np.log(tau**2 * (tau + 2) / (2 * (_EXCITATION / ELECTRON_MASS) ** 2))
-    scale = 2 * np.pi * _RADIUS**2 * ELECTRON_MASS * _ATOMS * _Z / 10
-    return np.asarray(scale / beta2 * (logarithm + form - density))
-
-
-def _radiation(kinetic: float | Array, photon: Array) -> Array:
+def _radiation(kinetic: float | FloatArray, photon: FloatArray) -> FloatArray:
     """K dΣ/dk in 1/mm: photon energy times macroscopic cross section per photon energy."""
     before = kinetic + ELECTRON_MASS
     after = before - photon
@@ -295,9 +280,9 @@ class Event(NamedTuple):
     of deposits and photons for which there was no room.
     """
 
-    hits: Array
-    photons: Array
-    counts: npt.NDArray[np.int64]
+    hits: FloatArray
+    photons: FloatArray
+    counts: IntArray
 
 
 @kernel(error_model="numpy")
@@ -499,10 +484,10 @@ def simulate_events(
     medium: Medium,
     source: tuple[float, float, float, float],
     n_primaries: int,
-    windows: Array,
-    missing: Integers,
+    windows: FloatArray,
+    missing: IntArray,
     rng: np.random.Generator,
-) -> tuple[Array, Integers, int, int]:
+) -> tuple[FloatArray, IntArray, int, int]:
     """Simulate until the primaries or the missing events run out.
 
     An event counts if it lies in one of the `windows` (low and high in MeV) of which events

@@ -20,6 +20,7 @@ from pydantic import Field, model_validator
 from cpunet.settings import Config, Millimetres
 
 FloatArray = npt.NDArray[np.float64]
+IntArray = npt.NDArray[np.int64]
 BoolArray = npt.NDArray[np.bool_]
 RegionArray = npt.NDArray[np.int8]
 Angle = Annotated[float, Field(ge=0, lt=90)]
@@ -27,8 +28,8 @@ _Size = Annotated[float, Field(gt=0, le=1000)]  # mm
 _Length = Annotated[float, Field(ge=-1e6, le=1e6)]  # mm; of an exponential, either sign
 _Density = Annotated[float, Field(ge=-1e4, le=1e4)]
 
+# fieldgen's ditch includes the nodes on its walls: half a step more of its usual grid
 FIELDGEN_HALF_STEP_MM = 0.05
-"""fieldgen's ditch includes the nodes on its walls: half a step more of its usual grid."""
 
 
 class Detector(Config):

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-FloatArray = npt.NDArray[np.float64]
-IntArray = npt.NDArray[np.int64]
+from cpunet.simulation.geometry import FloatArray, IntArray
 
 
 @dataclass(frozen=True)

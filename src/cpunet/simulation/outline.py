@@ -10,15 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.geometry import Detector
-
-Array = npt.NDArray[np.float64]
+from cpunet.simulation.geometry import Detector, FloatArray
 
 POINT_CONTACT, LI_CONTACT, GERMANIUM, DITCH = 0, 1, 2, 5
 
-_TOLERANCE = 1e-6
-"""Surfaces that coincide with a grid line do so despite rounding; in mm."""
-
+_TOLERANCE = 1e-6  # mm; surfaces that coincide with a grid line do so despite rounding
 
 # What of a detector makes its outline, under the same names: its lengths in mm, and more.
 _LENGTHS = ("_length", "_radius", "_depth", "_thickness")
@@ -47,7 +43,7 @@ def places(
 
 
 @kernel(error_model="numpy")
-def _fill(outline: Outline, r: Array, z: Array, values: npt.NDArray[np.int8]) -> None:
+def _fill(outline: Outline, r: FloatArray, z: FloatArray, values: npt.NDArray[np.int8]) -> None:
     """Region of each place, and 1 if it lies inside."""
     region, inside = values
     radius, length = outline.point_contact_radius, outline.point_contact_length

@@ -50,7 +50,7 @@ class Grid:
 
     r_mm: FloatArray
     z_mm: FloatArray
-    step_mm: float
+    grid_mm: float
     region: RegionArray
     r_steps: FloatArray
     z_steps: FloatArray
@@ -86,7 +86,7 @@ def make_grid(detector: Detector) -> Grid:
     return Grid(
         r_mm=r,
         z_mm=z,
-        step_mm=h,
+        grid_mm=h,
         region=region,
         r_steps=_steps(detector, rr, zz, region),
         z_steps=_steps(detector, rr.T, zz.T, region.T).T,
@@ -128,8 +128,8 @@ class Potentials(Grid):
 
     Parameters
     ----------
-    point_contact
-        Potential with 1 on the point contact and 0 on the lithium: the weighting potential.
+    weighting_potential
+        Potential with 1 on the point contact and 0 on the lithium.
     bias
         Potential with 1 on the lithium and 0 on the point contact.
     impurities, tilt, surface
@@ -139,7 +139,7 @@ class Potentials(Grid):
         Capacitance of the point contact in pF.
     """
 
-    point_contact: FloatArray
+    weighting_potential: FloatArray
     bias: FloatArray
     impurities: FloatArray
     tilt: FloatArray
@@ -157,10 +157,19 @@ class Potentials(Grid):
         total = bias_V * self.bias + impurity_scale * self.impurities + self.surface
         return total + impurity_tilt * self.tilt if impurity_tilt else total
 
-    def depletion_V(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
+    def depletion(self, impurity_scale: float = 1.0, impurity_tilt: float = 0.0) -> float:
         """Smallest bias in V that depletes the detector; infinite if none up to 20 kV does."""
+        low, high = 0.0, HIGHEST_BIAS_V
         charges = self.total_V(0.0, impurity_scale, impurity_tilt)
-        return depletion_voltage(self.bias, charges, self.region)
+        if has_pocket(high * self.bias + charges, self.region):
+            return float("inf")
+        if not has_pocket(charges, self.region):
+            return 0.0
+        while high - low > _RESOLUTION_V:
+            middle = (low + high) / 2
+            pocket = has_pocket(middle * self.bias + charges, self.region)
+            low, high = (middle, high) if pocket else (low, middle)
+        return high
 
 
 def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
@@ -179,11 +188,20 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     >>> detector = read_detector("ppc", ["grid_mm=0.5"])
     >>> grid = make_grid(detector)
     >>> parts = solve_potentials(detector, grid)
-    >>> bool(abs(parts.point_contact + parts.bias - 1)[grid.free].max() < 1e-9)
+    >>> bool(abs(parts.weighting_potential + parts.bias - 1)[grid.free].max() < 1e-9)
     True
     """
-    r_flux, z_flux, to_ground = conductances(detector, grid)
-    free, n_z = grid.free, len(grid.z_mm)
+    # conductances of the steps, area times permittivity over length per unit angle, in mm; a step
+    # in r crosses the upper half of the cell below it and the lower of the one above
+    h, free, n_z = grid.grid_mm, grid.free, len(grid.z_mm)
+    epsilon = 1 + (EPSILON_GERMANIUM - 1) * _germanium_in_cells(detector, grid)
+    middle = (grid.r_mm[:-1] + grid.r_mm[1:]) / 2
+    between = on_nodes(epsilon / 2, epsilon / 2, axis=1)
+    r_flux = between * middle[:, np.newaxis] / grid.r_steps
+    inner, outer = _half_rings(grid)
+    z_flux = on_nodes(epsilon * inner[1:] / h, epsilon * outer[:-1] / h, axis=0) / grid.z_steps
+    gap = detector.vacuum_gap
+    to_ground = (inner + outer)[:, 0] / gap if gap else np.zeros(len(grid.r_mm))
     above, below = np.pad(z_flux, ((0, 0), (0, 1))), np.pad(z_flux, ((0, 0), (1, 0)))
     diagonal = on_nodes(r_flux, r_flux, axis=0) + above + below
     diagonal[:, 0] += to_ground
@@ -204,7 +222,7 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
         return potential
 
     nothing = np.zeros(free.shape)
-    point_contact = solved((grid.region == POINT_CONTACT).astype(float), nothing)
+    weighting = solved((grid.region == POINT_CONTACT).astype(float), nothing)
     bias = solved((grid.region == LI_CONTACT).astype(float), nothing)
     impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
     impurities = solved(nothing, charges(detector, grid, impurity))
@@ -214,40 +232,18 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     surface = nothing
     if detector.surface_charge_1e10_per_cm2:
         surface = solved(nothing, surface_charges(detector, grid))
-    energy = (r_flux * np.diff(point_contact, axis=0) ** 2).sum()
-    energy += (z_flux * np.diff(point_contact, axis=1) ** 2).sum()
-    energy += (to_ground * point_contact[:, 0] ** 2).sum()
+    energy = (r_flux * np.diff(weighting, axis=0) ** 2).sum()
+    energy += (z_flux * np.diff(weighting, axis=1) ** 2).sum()
+    energy += (to_ground * weighting[:, 0] ** 2).sum()
     return Potentials(
         **vars(grid),
-        point_contact=point_contact,
+        weighting_potential=weighting,
         bias=bias,
         impurities=impurities,
         tilt=tilt,
         surface=surface,
         capacitance_pF=float(2 * np.pi * PF_PER_MM * energy),
     )
-
-
-def conductances(detector: Detector, grid: Grid) -> tuple[FloatArray, FloatArray, FloatArray]:
-    r"""Conductance of each step, :math:`A \varepsilon / d` per unit angle, in mm.
-
-    Returns
-    -------
-    r_flux, z_flux, to_ground
-        Conductances of the steps in r (nr-1, nz), of those in z (nr, nz-1), and from z = 0 to
-        a grounded plane (nr).
-    """
-    h = grid.step_mm
-    epsilon = 1 + (EPSILON_GERMANIUM - 1) * _germanium_in_cells(detector, grid)
-    # a step in r crosses the upper half of the cell below it and the lower of the one above
-    between = on_nodes(epsilon / 2, epsilon / 2, axis=1)
-    middle = (grid.r_mm[:-1] + grid.r_mm[1:]) / 2
-    r_flux = between * middle[:, np.newaxis] / grid.r_steps
-    inner, outer = _half_rings(grid)
-    z_flux = on_nodes(epsilon * inner[1:] / h, epsilon * outer[:-1] / h, axis=0) / grid.z_steps
-    gap = detector.vacuum_gap
-    to_ground = (inner + outer)[:, 0] / gap if gap else np.zeros(len(grid.r_mm))
-    return r_flux, z_flux, to_ground
 
 
 def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
@@ -267,7 +263,7 @@ def charges(detector: Detector, grid: Grid, impurity: FloatArray) -> FloatArray:
         # in fieldgen the ditch has 1/16 of the charge density of germanium
         germanium = germanium + (1 - germanium) / EPSILON_GERMANIUM
     inner, outer = _half_rings(grid)
-    h = grid.step_mm
+    h = grid.grid_mm
     half = on_nodes(germanium * inner[1:] * h / 2, germanium * outer[:-1] * h / 2, axis=0)
     return np.asarray(VOLT_PER_MM2 * impurity * on_nodes(half, half, axis=1))
 
@@ -298,7 +294,7 @@ def surface_charges(detector: Detector, grid: Grid) -> FloatArray:
         # below z = 0 and in the ditch is no germanium
         floor = np.abs(np.diff(germanium, axis=1, prepend=0))
         face[:, :-1] = on_nodes(floor * inner[1:], floor * outer[:-1], axis=0)
-        half_wall = np.abs(np.diff(germanium, axis=0)) * grid.step_mm / 2
+        half_wall = np.abs(np.diff(germanium, axis=0)) * grid.grid_mm / 2
         half_wall *= grid.r_mm[1:-1, np.newaxis]
         face[1:-1, 1:] += half_wall
         face[1:-1, :-1] += half_wall
@@ -315,7 +311,7 @@ def on_nodes(above: FloatArray, below: FloatArray, axis: int) -> FloatArray:
 
 def _half_rings(grid: Grid) -> tuple[FloatArray, FloatArray]:
     """Area (nr, 1) per unit angle, in mm2, of each half ring towards the axis and away."""
-    r, h = grid.r_mm[:, np.newaxis], grid.step_mm
+    r, h = grid.r_mm[:, np.newaxis], grid.grid_mm
     inner = np.where(r > 0, (r**2 - (r - h / 2) ** 2) / 2, 0)
     return inner, ((r + h / 2) ** 2 - r**2) / 2
 
@@ -324,43 +320,10 @@ def _germanium_in_cells(detector: Detector, grid: Grid) -> FloatArray:
     """Fraction (nr-1, nz-1) of each cell between four nodes that lies outside the ditch."""
     inner, outer, depth = detector.ditch_walls
     in_r, in_z = (
-        np.maximum(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0) / grid.step_mm
+        np.maximum(np.minimum(edges[1:], high) - np.maximum(edges[:-1], low), 0) / grid.grid_mm
         for edges, low, high in ((grid.r_mm, inner, outer), (grid.z_mm, 0.0, depth))
     )
     return np.asarray(1 - in_r[:, np.newaxis] * in_z)
-
-
-def depletion_voltage(bias: FloatArray, impurities: FloatArray, region: RegionArray) -> float:
-    r"""Smallest bias in V at which the potential has no pocket; infinite if there is none.
-
-    Parameters
-    ----------
-    bias, impurities
-        Potentials of a unit bias, and of the impurities in V, shape (nr, nz).
-    region
-        Region of each node, as from `Detector.region`.
-
-    Examples
-    --------
-    A planar detector of thickness :math:`d` depletes at :math:`e N d^2 / 2 \varepsilon`.
-
-    >>> import numpy as np
-    >>> z = np.tile(np.linspace(0, 10, 401), (3, 1))  # mm
-    >>> impurities = -10 * z * (10 - z) / 2  # e N / epsilon = 10 V / mm2
-    >>> region = np.where(z == 0, 0, np.where(z == 10, 1, 2))
-    >>> bool(abs(depletion_voltage(z / 10, impurities, region) - 500) < 5)
-    True
-    """
-    low, high = 0.0, HIGHEST_BIAS_V
-    if has_pocket(high * bias + impurities, region):
-        return float("inf")
-    if not has_pocket(impurities, region):
-        return 0.0
-    while high - low > _RESOLUTION_V:
-        middle = (low + high) / 2
-        pocket = has_pocket(middle * bias + impurities, region)
-        low, high = (middle, high) if pocket else (low, middle)
-    return high
 
 
 def has_pocket(potential: FloatArray, region: RegionArray) -> bool:

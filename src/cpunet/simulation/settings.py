@@ -15,7 +15,6 @@ from cpunet.simulation.geometry_readers import read_detector
 _Factor = Annotated[float, Field(ge=0.2, le=5)]
 _Nanoseconds = Annotated[float, Field(ge=0.01, le=1e6)]
 _Diffusion = Annotated[float, Field(gt=0, le=1000)]
-_MAX_STEPS = 2_000_000
 _PerUs = Annotated[float, Field(ge=0, le=100)]
 # Steps to propose for a period that the step does not divide.
 _FINER_NS = (2.0, 1.0, 0.5, 0.25, 0.1, 0.05, 0.01)
@@ -73,7 +72,7 @@ class SimulationSettings(Config):
 
     step_ns: _Nanoseconds = 1.0
     dt_ns: _Nanoseconds = 16.0
-    length_ns: Annotated[float, Field(gt=0, le=1e7)] = 3600.0
+    length_ns: Annotated[float, Field(gt=0, le=1e5)] = 3600.0
     diffusion: bool = True
     diffusion_constant: _Diffusion | Literal["temperature", "siggen"] = 0.12
     cloud_fwhm_mm: Annotated[float, Field(ge=0, le=20)] = 0.1
@@ -130,22 +129,14 @@ class SimulationSettings(Config):
             )
         if self.length_ns < self.dt_ns:
             raise ValueError("length_ns must be at least dt_ns")
-        if self.n_steps > _MAX_STEPS:
-            raise ValueError(
-                f"length_ns has {self.n_steps} steps of step_ns; at most {_MAX_STEPS} are "
-                "held at once"
-            )
         return self
 
 
 _SHIFTS = Path(__file__).parent / "shifts"
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Factor = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-
-# keys of `Shift` that stand for another field, and those that replace a value
+Factor = Annotated[float, Field(gt=0)]
+# keys of `Shift` that stand for another field
 _NAMES = {"impurity_factor": "impurity_scale", "li_thickness_mm": "li_thickness"}
-_INSTEAD = ("cloud_fwhm_mm", "diffusion_constant", "self_repulsion")
 
 
 def detector_and_settings(
@@ -211,20 +202,20 @@ hole_velocity_low_factor, hole_velocity_high_factor
 
     switches = ("self_repulsion",)
 
-    temperature_K: Number = 0.0
-    bias_V: Number = 0.0
+    temperature_K: float = 0.0
+    bias_V: float = 0.0
     impurity_factor: Factor = 1.0
-    impurity_tilt_1e10_per_cm4: Number = 0.0
-    li_thickness_mm: Number = 0.0
+    impurity_tilt_1e10_per_cm4: float = 0.0
+    li_thickness_mm: float = 0.0
     electron_velocity_low_factor: Factor = 1.0
     electron_velocity_high_factor: Factor = 1.0
     hole_velocity_low_factor: Factor = 1.0
     hole_velocity_high_factor: Factor = 1.0
-    electron_trapping_per_us: Number = 0.0
-    hole_trapping_per_us: Number = 0.0
-    cloud_fwhm_mm: Number | None = None
-    diffusion_constant: Number | Literal["temperature", "siggen"] | None = None
-    self_repulsion: Number | None = None
+    electron_trapping_per_us: float = 0.0
+    hole_trapping_per_us: float = 0.0
+    cloud_fwhm_mm: float | None = None
+    diffusion_constant: float | Literal["temperature", "siggen"] | None = None
+    self_repulsion: float | None = None
 
     @classmethod
     def of(cls, parts: Set) -> Shift:
@@ -255,7 +246,7 @@ hole_velocity_low_factor, hole_velocity_high_factor
             name = _NAMES.get(key, key)
             if name not in values:
                 continue
-            if key in _INSTEAD:
+            if type(self).model_fields[key].default is None:
                 values[name] = change
             elif key.endswith("_factor"):
                 values[name] *= change

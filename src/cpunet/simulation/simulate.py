@@ -386,10 +386,7 @@ def simulate(
     peaks = load_recipe("fast").peaks
     source: HitFile | GammaSource
     if hits is not None:
-        names = (
-            events if isinstance(events, str) else ",".join(peaks if events is None else events)
-        )
-        windows = energy_windows(names, peaks, physics.window_kev)
+        windows = energy_windows(peaks if events is None else events, peaks, physics.window_kev)
         source = hits if events is None else replace(hits, windows=tuple(windows))
     elif events is not None:
         wanted = wanted_events(events, peaks, physics.window_kev)
