@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
-from itertools import chain
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.calibration.identifiability import Linear
-from cpunet.calibration.joint_problem import JointProblem, SlicedJoint, first
+from cpunet.calibration.joint_problem import OTHERS, JointProblem, SlicedJoint, first
 from cpunet.calibration.nearby import Derivative, Nearby, Simulator, half_maxima, move
 from cpunet.calibration.nuisances import Physics, named
 from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
@@ -97,7 +96,7 @@ def test_chi_square_is_that_of_the_definition(problem, functions):
     assert both.compared()[1] == pytest.approx(
         deviation / np.sqrt(covariance.diagonal()), abs=1e-3
     )
-    assert both.moments == sum(map(len, functions.names.values())) == len(deviation)
+    assert both.moments == sum(functions.groups.values()) == len(deviation)
 
 
 def test_chance_gives_less_than_one_per_function_because_of_the_diagonal():
@@ -214,29 +213,24 @@ def test_windows_do_not_jump_where_the_alignment_of_pulses_does(problem, nearby)
     assert (prepared(0.3).align_sample != prepared(0.0).align_sample).any()
 
 
-def names_of(functions: SlicedJoint) -> list[str]:
-    return [*chain.from_iterable(functions.names.values())]
-
-
-def values_of(functions, words):
-    """Values of the functions whose names begin so, for the measured pulses."""
-    chosen = [i for i, name in enumerate(names_of(functions)) if name.startswith(words)]
-    assert chosen
-    return functions.data[:, chosen]
+def values_of(functions, group):
+    """Values of the functions of a group, for the measured pulses."""
+    names, numbers = [*functions.groups], [*functions.groups.values()]
+    end = sum(numbers[: names.index(group) + 1])
+    return functions.data[:, end - functions.groups[group] : end]
 
 
 def test_slices_multiply_components_and_amplitudes(functions):
     """All slices are numbers of the drift time times what is sliced."""
-    second, third = (
-        functions.data[:, names_of(functions).index(f"component {c}")] for c in (2, 3)
-    )
-    slices = [values_of(functions, f"component {c}, slice") for c in (2, 3)]
+    second, third = values_of(functions, "components")[:, [-2, -3]].T
+    slices = values_of(functions, "components in slices").reshape(len(second), OTHERS, -1)
     np.testing.assert_allclose(
-        slices[0] * third[:, None], slices[1] * second[:, None], atol=1e-9
+        slices[:, 0] * third[:, None], slices[:, 1] * second[:, None], atol=1e-9
     )
     some = np.abs(second) > 0.1
-    shares = slices[0][some] / second[some, None]
-    amplitude = values_of(functions, "current amplitude, bin 3, slice")[some]
+    shares = slices[some, 0] / second[some, None]
+    amplitude = values_of(functions, "current amplitude in slices")
+    amplitude = amplitude.reshape(len(second), -1, shares.shape[1])[some, 2]
     k = shares.argmax(axis=1)[:, None]
     bins = np.take_along_axis(amplitude / shares.clip(1e-12), k, 1)
     np.testing.assert_allclose(amplitude, bins * shares, atol=1e-9)

@@ -24,7 +24,7 @@ NUISANCES = tuple(named(name) for name in SHORT)
 PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), NUISANCES)
 
 
-def calibrated(values=(), degenerate=False) -> CalibratedPhysics:
+def calibrated(values) -> CalibratedPhysics:
     """A calibration that ended at these values, in their order; others are as simulated."""
     recipe, at = load_recipe("fast"), np.zeros(5)
     response = ElectronicsResponse(recipe.matching[0], DT_NS)
@@ -37,10 +37,6 @@ def calibrated(values=(), degenerate=False) -> CalibratedPhysics:
         vector[problem.n_chain + i] = NUISANCES[i].coordinate(nominal, value)
     problem.set(vector)
     covariance = 1e-4 * np.eye(len(vector))
-    if degenerate:
-        n, widths = problem.n_chain, problem.widths[problem.n_chain :][:2]
-        shares = np.array([[1, -0.99], [-0.99, 1]])
-        covariance[n : n + 2, n : n + 2] = 0.64 * shares * np.outer(widths, widths)
     chi = ChiSquare(
         before=9.0, after=2.0, moments=2, expected=2.0, spread=0.5, errors_scaled_by=1.0
     )
@@ -86,15 +82,6 @@ def test_what_cannot_be_is_no_finding(values, name, why):
     assert not any("no other physics are needed" in note for note in result.notes)
     assert result.comment.startswith(f"# {name}: unreliable value, makes up for something")
     assert result.comment.count("\n") == 1
-
-
-def test_of_a_degenerate_pair_the_direction_is_told():
-    (pair,) = calibrated((93.0, 1.05), degenerate=True).together
-    assert pair.components == pytest.approx(
-        {"temperature_K": 0.5**0.5, "impurity_factor": 0.5**0.5}
-    )
-    assert pair.value == pytest.approx((8 / 3 + np.log(1.05) / 0.1) / 2**0.5)
-    assert pair.error == pytest.approx(0.08)
 
 
 EVENTS, FUNCTIONS, PARTS, TRUE = 240, 60, 8, 0.3

@@ -269,9 +269,9 @@ def test_diodes_that_cannot_be_simulated(tmp_path, change: dict[str, Any], said:
     assert said in refused(written(tmp_path, "B.json", json.dumps(diode)), "temperature_K=90")
 
 
-def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
+def siggen(folder: Path, more: str = "", without: str = "#") -> Detector:
     """The detector of the configuration, with lines added at its end or left out."""
-    lines = [line for line in SIGGEN.splitlines() if not (without and line.startswith(without))]
+    lines = [line for line in SIGGEN.splitlines() if not line.startswith(without)]
     return read_detector(written(folder, "D.config", "\n".join([*lines, more, ""])))
 
 
@@ -281,20 +281,20 @@ def siggen(folder: Path, more: str = "", without: str = "") -> Detector:
         ("xtal_diam 70.5", "xtal_radius", "crystal_radius", 35.25),
         ("pc_diam 7", "pc_radius", "point_contact_radius", 3.5),
         ("hole_diam 9", "hole_radius", "bore_radius", 4.5),
-        ("taper_length 4.5", "", "bottom_taper_length", 4.5),
-        ("pc_radius 4", "", "point_contact_radius", 4),
+        ("taper_length 4.5", "#", "bottom_taper_length", 4.5),
+        ("pc_radius 4", "#", "point_contact_radius", 4),
         # lines that begin with a space are comments
-        (" pc_radius 4\n\tpc_radius 5", "", "point_contact_radius", 2.3),
+        (" pc_radius 4\n\tpc_radius 5", "#", "point_contact_radius", 2.3),
         # as far as the ditch, where a larger one ends, and one of 0 is meant
-        ("pc_radius 14", "", "point_contact_radius", 11),
-        ("pc_radius 0", "", "point_contact_radius", 11),
-        ("hole_bullet_radius 6", "", "bore_bullet_radius", 5),
+        ("pc_radius 14", "#", "point_contact_radius", 11),
+        ("pc_radius 0", "#", "point_contact_radius", 11),
+        ("hole_bullet_radius 6", "#", "bore_bullet_radius", 5),
         # a taper ends where the bottom of the hole is rounded, as wide as it was meant to be
-        ("inner_taper_length 68", "", "inner_taper_length", 64.9),
-        ("inner_taper_length 68", "", "inner_taper_angle_deg", 10.467333),
-        ("inner_taper_length 68\nhole_bullet_radius 6", "", "inner_taper_length", 63.9),
-        ("hole_length_gap 32", "", "bore_length", 64),
-        ("pc_offset_x 0\nhole_offset_y_top 0.0", "", "bore_radius", 5),
+        ("inner_taper_length 68", "#", "inner_taper_length", 64.9),
+        ("inner_taper_length 68", "#", "inner_taper_angle_deg", 10.467333),
+        ("inner_taper_length 68\nhole_bullet_radius 6", "#", "inner_taper_length", 63.9),
+        ("hole_length_gap 32", "#", "bore_length", 64),
+        ("pc_offset_x 0\nhole_offset_y_top 0.0", "#", "bore_radius", 5),
         # no ditch: a wrap-around as far as the wall, or further, is none
         ("wrap_around_radius 40.45", "ditch", "wrap_around_radius", 0),
     ],

@@ -158,33 +158,35 @@ def test_detectors_of_one_table(tmp_path: Path, layout: str, column: str, detect
     np.testing.assert_allclose(read_hits(path, HitOptions(f"{small}")).energy_kev, 238.6)
 
 
+JOINED = [3, 3, 8, 8, 9, 9, 2, 2, 3, 3, 8, 8]
+# two threads with even and odd events; the blocks end within 4 and 5
+THREADS = [0, 2, 4, 1, 3, 5, 4, 6, 5, 7, 8, 9]
+
+
 @pytest.mark.parametrize("layout", ["flat", "csv", "hdf5"])
-def test_joined_jobs_number_their_events_anew(tmp_path: Path, layout: str) -> None:
-    numbers = np.repeat([3, 8, 9, 2, 3, 8], [6, 6, 6, 6, 6, 6])
-    path = written(tmp_path, layout, steps(evtid=(numbers, ""), time=(0 * TIME_NS, "ns")))
-    hits = read_hits(path)
-    assert np.diff(hits.offsets).tolist() == [6] * 6
-    assert hits.event_number.tolist() == [3, 8, 9, 2, 10, 11]
+@pytest.mark.parametrize(
+    ("numbers", "events", "steps_of_event"),
+    [
+        (JOINED, [3, 8, 9, 2, 10, 11], [6] * 6),
+        (THREADS, [0, 2, 4, 1, 3, 5, 6, 7, 8, 9], [3, 3, 6, 3, 3, 6, 3, 3, 3, 3]),
+    ],
+)
+def test_joined_jobs_number_their_events_anew_and_threads_do_not(
+    tmp_path: Path, layout: str, numbers, events, steps_of_event
+) -> None:
+    changed = {"evtid": (np.repeat(numbers, 3), ""), "time": (0 * TIME_NS, "ns")}
+    hits = read_hits(written(tmp_path, layout, steps(**changed)))
+    assert np.diff(hits.offsets).tolist() == steps_of_event
+    assert hits.event_number.tolist() == events
 
 
 def test_joined_csv_files_are_read_as_jobs(tmp_path: Path) -> None:
-    columns = ["event", "Edep", "x", "y", "z", "volume"]
-    rows = [f"{i},{i + 1},1,2,3,Ge#1" for i in range(4)]
-    alone = csv_file(tmp_path, columns, rows, title="steps data").read_text()
-    joined = tmp_path / "joined.csv"
-    joined.write_text(f"{alone}\n{alone}\n{alone}")
-    hits = read_hits(joined)
+    rows = [f"{i},{i + 1},1,2,3" for i in range(4)]
+    alone = csv_file(tmp_path, STEP, rows, title="steps data")
+    alone.write_text("\n".join(3 * [alone.read_text()]))
+    hits = read_hits(alone)
     assert hits.energy_kev.tolist() == [1000, 2000, 3000, 4000] * 3
     assert len(set(hits.event_number)) == 12
-
-
-def test_events_that_threads_wrote_in_blocks_stay_whole(tmp_path: Path) -> None:
-    # two threads with even and odd events; the blocks end within 4 and 5
-    numbers = np.repeat([0, 2, 4, 1, 3, 5, 4, 6, 5, 7, 8, 9], 3)
-    path = written(tmp_path, "flat", steps(evtid=(numbers, ""), time=(0 * TIME_NS, "ns")))
-    hits = read_hits(path)
-    assert hits.event_number.tolist() == [0, 2, 4, 1, 3, 5, 6, 7, 8, 9]
-    assert np.diff(hits.offsets).tolist() == [3, 3, 6, 3, 3, 6, 3, 3, 3, 3]
 
 
 def test_rows_in_the_order_of_time_stay_together(tmp_path: Path) -> None:
@@ -349,13 +351,11 @@ def test_archives(tmp_path: Path, name: str, values: list[Any]) -> None:
     one_line(lambda: read_hits(path), str(path))
 
 
-def test_archives_name_no_detector_and_a_far_origin_is_refused(tmp_path: Path) -> None:
+def test_archives_name_no_detector(tmp_path: Path) -> None:
     path = tmp_path / "hits.npz"
     np.savez(path, **(GOOD | {"offsets": np.array([0.0, 2, 3])}))
     assert read_hits(path).offsets.tolist() == [0, 2, 3]
     with pytest.raises(CpunetError, match="name no detector to pick V01 by; leave"):
         read_hits(path, HitOptions("V01"))
-    with pytest.raises(CpunetError, match="check the units and the origin"):
-        read_hits(path, HitOptions(origin=(1e300, 0, 0)))
     with pytest.raises(CpunetError, match="cannot be read"):
         read_hits(tmp_path / "none.lh5")

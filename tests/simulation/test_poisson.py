@@ -15,7 +15,6 @@ from cpunet.simulation.outline import GERMANIUM
 from cpunet.simulation.poisson import (
     EPSILON_GERMANIUM,
     VOLT_PER_MM2,
-    depletion_voltage,
     make_grid,
     solve_potentials,
     surface_charges,
@@ -151,13 +150,3 @@ def test_the_walls_of_an_exact_ditch_are_passivated_as_well() -> None:
         # the lower half step of the walls lies on the nodes of z = 0
         of_ditch -= 2 * np.pi * 0.125 * (inner + outer)
         assert charge[walls].sum() == pytest.approx(SQUARE_MM * of_ditch)
-
-
-def test_a_pocket_that_no_bias_reaches() -> None:
-    bias = np.ones((9, 9))
-    bias[0] = 0
-    impurities = np.full((9, 9), 0.0)
-    impurities[5, 5] = -1.0
-    region = np.full((9, 9), 2, np.int8)
-    region[0] = 0
-    assert depletion_voltage(bias, impurities, region) == float("inf")

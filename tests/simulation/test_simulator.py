@@ -29,21 +29,14 @@ SIGGEN = PLAIN.model_copy(
 ICPC = read_detector("icpc")  # at 90 K, as the reference pulses
 
 
+def siggen(folder: Path, kind: str) -> dict[str, np.ndarray]:
+    """Pulses of the reference, with places and clouds."""
+    with np.load(folder / "siggen" / f"waveforms_{kind}_A_outertaper_grid0.1.npz") as data:
+        return dict(data)
+
+
 def of(fields: FieldMaps, settings: SimulationSettings) -> Simulator:
     return Simulator(ICPC, settings, fields=fields)
-
-
-def test_planar_detector_has_straight_edges(planar: FieldMaps) -> None:
-    signals = of(planar, PLAIN).signals([0.0], [0.0], [8.0], [100.0])
-    field = [[0, 0, -1000.0]]
-    table, field = velocity_table(90), (0.0, 0.0, -1000.0)
-    speeds = [abs(carrier_velocity(*table, c, *field)[2]) for c in (HOLE, ELECTRON)]
-    t = np.arange(PLAIN.n_samples)
-    expected = np.minimum(speeds[0] * t, 6) / 10 + np.minimum(speeds[1] * t, 4) / 10
-    np.testing.assert_allclose(signals.waveforms[0], expected, atol=1e-3)
-    assert signals.valid.all()
-    assert signals.collected.all()
-    assert signals.collection_time_ns[0] == pytest.approx(6 / speeds[0], abs=2)
 
 
 @given(st.floats(0, 18), st.floats(0, 6.28), st.floats(2.5, 11.5))
@@ -84,10 +77,8 @@ def test_a_bad_hit_is_named(planar: FieldMaps) -> None:
 
 
 def test_reference_pulses(reference_data: Path, reference_maps: FieldMaps) -> None:
-    with np.load(
-        reference_data / "siggen" / "waveforms_plain_A_outertaper_grid0.1.npz"
-    ) as data:
-        start, expected = data["positions"], data["wf1"]
+    data = siggen(reference_data, "plain")
+    start, expected = data["positions"], data["wf1"]
     signals = of(reference_maps, PLAIN).signals(*start.T, 100.0)
     assert signals.valid.all()
     assert signals.collected.all()
@@ -99,10 +90,8 @@ def test_reference_pulses(reference_data: Path, reference_maps: FieldMaps) -> No
 
 @pytest.mark.thorough
 def test_pulses_in_own_fields_agree_with_the_reference(reference_data: Path) -> None:
-    with np.load(
-        reference_data / "siggen" / "waveforms_plain_A_outertaper_grid0.1.npz"
-    ) as data:
-        start, expected = data["positions"], data["wf1"]
+    data = siggen(reference_data, "plain")
+    start, expected = data["positions"], data["wf1"]
     signals = Simulator(ICPC, PLAIN).signals(*start.T, 100.0)
     collected = [np.argmax(w > 0.995, axis=1) for w in (signals.waveforms, expected)]
     assert np.abs(np.subtract(*collected)).max() <= 1
@@ -110,11 +99,8 @@ def test_pulses_in_own_fields_agree_with_the_reference(reference_data: Path) -> 
 
 
 def test_reference_clouds(reference_data: Path, reference_maps: FieldMaps) -> None:
-    with np.load(
-        reference_data / "siggen" / "waveforms_diffusion_A_outertaper_grid0.1.npz"
-    ) as data:
-        start, expected = data["positions"], data["wf1"]
-        steps, repelled = data["fwhm_steps"], data["fwhm_steps_ene2000"]
+    data = siggen(reference_data, "diffusion")
+    start, expected, steps = data["positions"], data["wf1"], data["fwhm_steps"]
     signals = of(reference_maps, SIGGEN).signals(*start.T, 100.0)
     # whole steps: one off is rounding
     assert np.abs(signals.cloud_fwhm_ns - steps).max() <= 1
@@ -122,18 +108,18 @@ def test_reference_clouds(reference_data: Path, reference_maps: FieldMaps) -> No
     assert np.sqrt(np.mean((signals.waveforms - expected) ** 2, axis=1)).max() < 3e-3
     strong = SIGGEN.model_copy(update={"self_repulsion": True})
     widths = of(reference_maps, strong).signals(*start.T, 2000.0).cloud_fwhm_ns
-    assert np.abs(widths - repelled).max() <= 1
+    assert np.abs(widths - data["fwhm_steps_ene2000"]).max() <= 1
 
 
 Array = npt.NDArray[np.float64]
-
+TABLE = velocity_table(90)
 RATES = {"hole_trapping_per_us": 2.0, "electron_trapping_per_us": 5.0}
 TRAPPED = SimulationSettings(dt_ns=1, length_ns=2400, diffusion=False, cloud_fwhm_mm=0)
 
 
 def hecht(t_ns: Array, path_mm: float, carrier: int, rate_per_us: float) -> Array:
     """Signal (of full scale) of a carrier that drifts `path_mm` of 10 mm at 1000 V/cm."""
-    speed = abs(carrier_velocity(*velocity_table(90), carrier, 0.0, 0.0, -1000.0)[2])
+    speed = abs(carrier_velocity(*TABLE, carrier, 0.0, 0.0, -1000.0)[2])
     rate = rate_per_us / 1000
     return speed / rate / 10 * -np.expm1(-rate * np.minimum(t_ns, path_mm / speed))
 
@@ -146,6 +132,9 @@ def test_a_uniform_field_follows_hecht(planar: FieldMaps, z: float) -> None:
     expected = hecht(t, z - 2, HOLE, 2.0) + hecht(t, 12 - z, ELECTRON, 5.0)
     np.testing.assert_allclose(signals.waveforms[0], expected, atol=1e-3)
     assert signals.trapped[0] == pytest.approx(1 - expected[-1], abs=2e-4)
+    speeds = [abs(carrier_velocity(*TABLE, c, 0.0, 0.0, -1000.0)[2]) for c in (HOLE, ELECTRON)]
+    last = max((z - 2) / speeds[0], (12 - z) / speeds[1])
+    assert signals.collection_time_ns[0] == pytest.approx(last, abs=2)
 
 
 def test_trapped_charge_lowers_the_energy_and_not_the_pulse(planar: FieldMaps) -> None:
@@ -247,13 +236,9 @@ def test_quick_differences_are_the_exact_ones(values: dict[str, float]) -> None:
 
 def hits_with(counts: list[int], seed: int = 0) -> Hits:
     rng = np.random.default_rng(seed)
-    n = sum(counts)
-    return Hits.of(
-        rng.uniform(0, 40, (n, 3)),
-        rng.uniform(1, 500, n),
-        np.concatenate([[0], np.cumsum(counts)]),
-        np.arange(len(counts)) * 10,
-    )
+    n, offsets = sum(counts), np.concatenate([[0], np.cumsum(counts)])
+    place, energy = rng.uniform(0, 10, (n, 3)), rng.uniform(0.1, 900, n)
+    return Hits.of(place, energy, offsets, np.arange(len(counts)) * 10)
 
 
 @given(st.lists(st.integers(0, 5), max_size=8), st.data())
@@ -269,14 +254,9 @@ def test_picking_events_keeps_their_hits(counts: list[int], data: st.DataObject)
     assert len(both) == len(hits)
 
 
-def event_of(n: int, seed: int) -> Hits:
-    rng = np.random.default_rng(seed)
-    return Hits.of(rng.uniform(0, 10, (n, 3)), rng.uniform(0.1, 900, n), [0, n])
-
-
 @given(st.integers(2, 30), st.integers(0, 10_000), st.floats(0, 20))
 def test_the_same_as_single_linkage(n: int, seed: int, distance: float) -> None:
-    hits = event_of(n, seed)
+    hits = hits_with([n], seed)
     label = fcluster(linkage(hits.position_mm), distance, criterion="distance")
     truth = np.sort(np.bincount(label, weights=hits.edep_kev)[1:])
     np.testing.assert_allclose(np.sort(merge_hits(hits, distance).edep_kev), truth)
@@ -284,9 +264,7 @@ def test_the_same_as_single_linkage(n: int, seed: int, distance: float) -> None:
 
 @given(st.lists(st.integers(0, 12), max_size=6), st.floats(0, 50))
 def test_energy_and_centre_of_each_event_stay(counts: list[int], distance: float) -> None:
-    hits = Hits.concatenate(
-        [Hits.of([], [], [0]), *(event_of(n, seed) for seed, n in enumerate(counts))]
-    )
+    hits = hits_with(counts)
     merged = merge_hits(hits, distance)
     np.testing.assert_allclose(merged.energy_kev, hits.energy_kev, rtol=1e-12)
     for axis in ("x_mm", "y_mm", "z_mm"):
