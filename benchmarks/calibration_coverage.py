@@ -99,8 +99,8 @@ def experiment(
         made = {k: v for k, v in SIMULATED.items() if k in {n.name for n in nuisances}}
         nominal = read_detector(detector)
         settings = SimulationSettings(**made)
-        before = Physics(nominal, settings, nuisances)
-        centres, widths = before.priors(GIVEN)
+        before = Physics(nominal, settings, nuisances, GIVEN)
+        centres, widths = before.priors()
         drawn = centres + widths * rng.normal(size=len(widths))
         stand = cpunet.make_stand(
             Path(folder) / "stand",
@@ -157,7 +157,7 @@ def _search(
         side.pulses.energy_kev[:] = LINE_KEV
     noise = noise_of(measured)
     stored = StoredSimulation.read(stand.sim.path)
-    physics = Physics(stored.detector, stored.settings, before.nuisances)
+    physics = Physics(stored.detector, stored.settings, before.nuisances, before.given)
     truth = [
         n.coordinate(physics.nominal(n), n.value(physics.nominal(n), float(x)))
         for n, x in zip(physics.nuisances, drawn, strict=True)
@@ -165,8 +165,6 @@ def _search(
     search = Search(
         simulator=Simulator(stored.hits[sim.index], physics),
         sets=PulseSets(sim.pulses, data.pulses, noise, recipe, np.random.default_rng(seed)),
-        recipe=recipe,
-        given={k: v for k, v in GIVEN.items() if k in {n.name for n in physics.nuisances}},
         chosen=True,
     )
     return search, np.array(truth)

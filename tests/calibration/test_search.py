@@ -44,10 +44,10 @@ def test_a_depletion_voltage_tells_the_impurities(tmp_path, monkeypatch, other_c
     for factor, more, error_V in ((0.9, 0.0, 3), (1.05, 0.0, 3), (1.1, 0.01, 15)):
         voltage = solve(detector).depletion(factor * scale, tilt + more)
         _, _, priors = freedom("impurity,tilt", [f"depletion_voltage={voltage}+-1"])
-        known = depletion(physics, priors)
+        known = depletion(replace(physics, given=priors))
         assert known(np.array([np.log(factor), more]))[0] == pytest.approx(0, abs=error_V)
         assert abs(known(np.zeros(2))[0]) > 50
-    assert not len(depletion(physics, {})(np.zeros(2)))
+    assert not len(depletion(physics)(np.zeros(2)))
 
 
 def test_a_parameter_that_explains_the_pulses_better_takes_the_place_of_another():
@@ -83,8 +83,8 @@ def test_a_detector_that_does_not_deplete_within_the_priors_is_refused(bias, giv
     )
     refusal = r"within the priors it depletes at .* its bias is .*;"
     with pytest.raises(CpunetError, match=refusal):
-        depletion(physics, given)
-    depletion(replace(physics, nuisances=physics.nuisances[:1]), {})  # as simulated it does
+        depletion(replace(physics, given=given))
+    depletion(replace(physics, nuisances=physics.nuisances[:1]))  # as simulated it does
 
 
 def test_what_is_free_and_what_is_not():
@@ -141,7 +141,7 @@ def test_a_given_prior_is_told_as_it_was_given(nuisance, factor, error):
     value = factor * (PHYSICS.nominal(nuisance) or 1.0)
     value = min(max(value, nuisance.lowest), nuisance.highest)
     i = NUISANCES.index(nuisance)
-    centres, widths = PHYSICS.priors({nuisance.name: (value, error)})
+    centres, widths = replace(PHYSICS, given={nuisance.name: (value, error)}).priors()
     assert PHYSICS.in_own_unit(i, centres[i], widths[i]) == pytest.approx((value, error))
 
 

@@ -23,7 +23,7 @@ from cpunet.calibration.calibrated_run import (
     Plan,
 )
 from cpunet.calibration.nearby import Simulator
-from cpunet.calibration.nuisances import Freedom, Physics, depletion, freedom, titled
+from cpunet.calibration.nuisances import Freedom, Physics, freedom, titled
 from cpunet.calibration.search import Search
 from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
@@ -166,7 +166,7 @@ def _planned(start: Start, force: bool, _name: str, pair: Pair, out: Path | None
         bar.total = 2 + 2 * len(physics.nuisances)
         linear = search.plan()
     errors, names = {}, [nuisance.name for nuisance in physics.nuisances]
-    for i, (centre, width) in enumerate(zip(*physics.priors(search.given), strict=True)):
+    for i, (centre, width) in enumerate(zip(*physics.priors(), strict=True)):
         own = partial(physics.in_own_unit, i, float(centre))
         errors[physics.nuisances[i].name] = ExpectedErrors(
             simulated=physics.nominal(physics.nuisances[i]),
@@ -214,7 +214,8 @@ def _calibrated(
         # all events of the file
         hits, values = HitFile(pair[0].path, placed=True), dict(settings)
         simulate(folder / SIM, detector=detector, hits=hits, settings=values, seed=seed)
-        recipe, selection = search.recipe, parse_selection(peak, search.recipe.peaks)
+        recipe = search.sets.recipe
+        selection = parse_selection(peak, recipe.peaks)
         sim = load_pulses(PulseFile(folder / SIM), "simulated", recipe, selection)
         # not stretched: what is off in the drift is for the physics to explain
         training = recipe.training.model_copy(update={"drift_terms": 0})
@@ -254,8 +255,7 @@ def _search(
         )
     recipe = data.recipe.at(data.dt_ns)
     looked_at, chosen, priors = free
-    physics = Physics(stored.detector, stored.settings, looked_at)
-    knowledge = depletion(physics, priors)
+    physics = Physics(stored.detector, stored.settings, looked_at, priors)
     noise, _ = trace_noise(data, recipe.preparation)
     # in random order, so that any first part is a representative sample
     rows = np.random.default_rng(seed).permutation(len(sim.prepared))[:events]
@@ -264,9 +264,6 @@ def _search(
     search = Search(
         simulator=Simulator(stored.hits[some.index], physics),
         sets=PulseSets(*pulses, noise.noise, recipe, rng, noise.tails),
-        recipe=recipe,
-        given=priors,
-        knowledge=knowledge,
         chosen=chosen,
     )
     return search, data

@@ -12,7 +12,7 @@ from what does not, the readout.  With Gaussian bins :math:`g_k` the functions a
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -159,8 +159,6 @@ class JointProblem:
         The chain before any fit, on which the priors of the same parameters are centred; those
         of others on their current values. Centred on the last fit, they would make a result
         depend on where the first fit ended.
-    given
-        Priors that replace the defaults: value and error by name.
     modes
         Deviations of the step response that are free, with priors of 0 ± 1, if the response
         has any.
@@ -181,7 +179,6 @@ class JointProblem:
     functions: Sequence[SlicedJoint]
     recipe: Recipe
     start: ElectronicsResponse
-    given: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     modes: Values = field(default_factory=lambda: NONE)
     knowledge: Callable[[Values], Values] = lambda _: np.empty(0)
     held: bool = False
@@ -201,7 +198,7 @@ class JointProblem:
         n_modes = len(self.along)
         self.n_chain = len(self.chain.labels) + n_modes
         chosen = [self.physics.nuisances[i] for i in self.free]
-        centres, widths = self.physics.priors(self.given)
+        centres, widths = self.physics.priors()
         self.centre = np.r_[self.chain.centre, np.zeros(n_modes), centres[self.free]]
         self.widths = np.r_[self.chain.widths, np.ones(n_modes), widths[self.free]]
         # a prior may lie far from what was simulated, and its centre must be reached

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
@@ -155,11 +155,15 @@ class Physics:
         Detector and settings as simulated.
     nuisances
         Parameters that may change, in the order of the coordinates.
+    given
+        Priors that replace the defaults: value and error by name, also of
+        ``"depletion_voltage"``.
     """
 
     detector: Detector
     settings: SimulationSettings
     nuisances: tuple[Nuisance, ...]
+    given: Mapping[str, tuple[float, float]] = field(default_factory=dict)
 
     def nominal(self, nuisance: Nuisance) -> float:
         """Simulated value; 1 for a factor that is not in the settings."""
@@ -203,19 +207,13 @@ class Physics:
         value = nuisance.value(nominal, coordinate)
         return value, float(nuisance.slope(value) * error)
 
-    def priors(self, given: Mapping[str, tuple[float, float]]) -> tuple[Values, Values]:
-        """Centres and widths of the coordinates before any data.
-
-        Parameters
-        ----------
-        given
-            Value and error by name; the others have their defaults around 0.
-        """
+    def priors(self) -> tuple[Values, Values]:
+        """Centres and widths of the coordinates before any data: as given, else around 0."""
         centres = np.zeros(len(self.nuisances))
         widths = np.array([nuisance.prior for nuisance in self.nuisances])
         for i, nuisance in enumerate(self.nuisances):
-            if nuisance.name in given:
-                nominal, (value, error) = self.nominal(nuisance), given[nuisance.name]
+            if nuisance.name in self.given:
+                nominal, (value, error) = self.nominal(nuisance), self.given[nuisance.name]
                 centres[i] = nuisance.coordinate(nominal, value)
                 widths[i] = error / nuisance.slope(value)
         return centres, widths
@@ -288,9 +286,7 @@ def freedom(
     return looked_at, bool(chosen), priors
 
 
-def depletion(
-    physics: Physics, given: Mapping[str, tuple[float, float]]
-) -> Callable[[Values], Values]:
+def depletion(physics: Physics) -> Callable[[Values], Values]:
     """Deviation of the depletion voltage from its measured value, in units of its error.
 
     Without a measured value among the priors the function gives no deviation.
@@ -301,9 +297,9 @@ def depletion(
         If a depletion voltage, as simulated, with the values of the priors, a step of the
         impurities higher, or as measured, is above the bias.
     """
-    centres, _ = physics.priors(given)
+    centres, _ = physics.priors()
     higher = np.array([(x.name == "impurity_factor") * x.step for x in physics.nuisances])
-    measured, bias = given.get(DEPLETION), physics.detector.bias_V
+    measured, bias = physics.given.get(DEPLETION), physics.detector.bias_V
     needed = [] if measured is None else [measured[0]]
     for coordinates in (higher, centres, np.zeros(len(centres))):
         detector, _ = physics.at(coordinates)

@@ -73,7 +73,7 @@ def described(
     physics = problem.physics
     n, free, fixed, notes = problem.n_chain, {}, {}, []
     # free parameters: value and error in their own units, and whether these can be true
-    centres, priors = physics.priors(problem.given)
+    centres, priors = physics.priors()
     errors = np.sqrt(covariance.diagonal()[n:])
     # sampling noise makes those with all free larger, too
     errors_all = linear.errors()
@@ -104,7 +104,7 @@ def described(
             doubt=doubt,
             prior=centre,
             prior_error=width,
-            source="given" if name in problem.given else nuisance.source,
+            source="given" if name in physics.given else nuisance.source,
         )
     # the others: what would be if they were free
     here, _ = linear.cost(problem.free)

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import copy
 import logging
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -20,11 +20,10 @@ from cpunet.calibration.calibrated_run import CalibratedPhysics, ChiSquare
 from cpunet.calibration.identifiability import Linear
 from cpunet.calibration.joint_problem import JointProblem, SlicedJoint, events, first
 from cpunet.calibration.nearby import Nearby, Simulator
-from cpunet.calibration.nuisances import Values
+from cpunet.calibration.nuisances import Values, depletion
 from cpunet.calibration.result import BEYOND_CHANCE, described, of_parts, of_weights
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import (
     POOR,
     WIDER,
@@ -67,12 +66,6 @@ class Search:
         Simulation of the events, with all parameters that may become free.
     sets
         Prepared simulated and measured datasets, in bands.
-    recipe
-        Recipe of the chain.
-    given
-        Priors that replace the defaults: value and error by name.
-    knowledge
-        Deviations from further knowledge of the coordinates.
     chosen
         Whether all parameters are free, since a user chose them; else those that the data
         determine.
@@ -80,30 +73,27 @@ class Search:
 
     simulator: Simulator
     sets: PulseSets
-    recipe: Recipe
-    given: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    knowledge: Callable[[Values], Values] = lambda _: np.empty(0)
     chosen: bool = False
 
     def __post_init__(self) -> None:
         self._sides = self.sets.sides()
         self._functions = self._compared(1.0)
-        nuisances = self.simulator.physics.nuisances
-        self._all, self._simulated = list(range(len(nuisances))), np.zeros(len(nuisances))
-        self._first = [i for i in self._all if self.chosen or nuisances[i].first]
-        dt_ns = self.simulator.physics.settings.dt_ns
-        config, training = self.recipe.matching
-        start = with_decay(ElectronicsResponse(config, dt_ns), self.sets.tail_slope)
+        physics, recipe = self.simulator.physics, self.sets.recipe
+        n, knowledge = len(physics.nuisances), depletion(physics)
+        self._all, self._simulated = list(range(n)), np.zeros(n)
+        self._first = [i for i in self._all if self.chosen or physics.nuisances[i].first]
+        config, training = recipe.matching
+        start = ElectronicsResponse(config, physics.settings.dt_ns)
+        start = with_decay(start, self.sets.tail_slope)
         # the chain alone, with the physics as simulated
         few = [sides.of(training.search_pulses) for sides in self._sides]
         self._chain = fit_chain(copy.deepcopy(start), few, Fitter(training)).response
         # of a chain, pulses near a point, free coordinates, and functions
         self._problem = partial(
             JointProblem,
-            recipe=self.recipe,
+            recipe=recipe,
             start=start,
-            given=self.given,
-            knowledge=self.knowledge,
+            knowledge=knowledge,
         )
         # of a usual search: derivatives take two each, of the first parameters, and of all
         self.simulations = USUAL_ROUNDS + 3 + 2 * (len(self._first) + len(self._all))

@@ -191,8 +191,8 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     >>> bool(abs(parts.weighting_potential + parts.bias - 1)[grid.free].max() < 1e-9)
     True
     """
-    # conductances of the steps per unit angle in mm: area times permittivity over length; a step
-    # in r crosses the upper half of the cell below it and the lower of the one above
+    # conductances of the steps per unit angle in mm: area times permittivity over length
+    # a step in r crosses the upper half of the cell below it and the lower of the one above
     h, free, n_z = grid.grid_mm, grid.free, len(grid.z_mm)
     epsilon = 1 + (EPSILON_GERMANIUM - 1) * _germanium_in_cells(detector, grid)
     middle = (grid.r_mm[:-1] + grid.r_mm[1:]) / 2
