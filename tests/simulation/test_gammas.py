@@ -131,16 +131,11 @@ def test_no_hit_lies_outside_its_detector(detector: Detector) -> None:
         assert detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm).all()
 
 
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"height": 20, "n": 10, "wanted": {FEP: 10**9}}, "10 gammas were not enough"),
-        ({"height": 20, "n": 10, "wanted": {EnergyWindow("a", 9, 2): 1}}, "a: window"),
-    ],
-)
-def test_impossible_wishes_are_refused(settings: dict[str, object], message: str) -> None:
-    with pytest.raises(CpunetError, match=message):
-        run(**settings)  # type: ignore[arg-type]
+def test_impossible_wishes_are_refused() -> None:
+    wishes = {FEP: "10 gammas were not enough", EnergyWindow("a", 9, 2): "a: window"}
+    for window, message in wishes.items():
+        with pytest.raises(CpunetError, match=message):
+            run(20, 10, wanted={window: 10**9})
 
 
 def test_electron_range_and_photon_attenuation() -> None:

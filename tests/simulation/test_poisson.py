@@ -105,18 +105,13 @@ def test_hemispheres_and_the_axis() -> None:
     assert found.capacitance_pF == pytest.approx(half_sphere, rel=5e-3)
 
 
-def test_a_grounded_plane_takes_a_part_of_the_potential() -> None:
-    grounded = Hemispheres(**values(0.2), vacuum_gap=1.0)
-    found = solve_potentials(grounded, make_grid(grounded))
-    assert (found.weighting_potential + found.bias).min() < 1 - 1e-3
-
-
-def test_surface_charge_bends_the_potential_down() -> None:
-    plain = Hemispheres(**values(0.2))
-    charged = Hemispheres(**values(0.2), surface_charge_1e10_per_cm2=-0.1)
+def test_a_grounded_plane_and_a_surface_charge_lower_the_potential() -> None:
+    plain, gap = Hemispheres(**values(0.2)), {"vacuum_gap": 1.0}
+    charged = plain.model_copy(update={"surface_charge_1e10_per_cm2": -0.1})
     grid = make_grid(plain)
-    found = [solve_potentials(d, grid) for d in (plain, charged)]
-    without, with_it = (potentials.impurities + potentials.surface for potentials in found)
+    found = [solve_potentials(d, grid) for d in (plain, charged, plain.model_copy(update=gap))]
+    without, with_it = (potentials.impurities + potentials.surface for potentials in found[:2])
+    assert (found[2].weighting_potential + found[2].bias).min() < 1 - 1e-3
     assert (with_it <= without + 1e-9).all()
     assert with_it[25, 0] < without[25, 0] - 1
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import h5py
 import lh5
@@ -17,7 +18,6 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.recipes import load_recipe
-from cpunet.settings import read_settings
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import read_hits
@@ -25,7 +25,6 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulate import GammaSource, HitFile, energy_windows, simulate
 from cpunet.simulation.simulator import merge_hits
-from synthetic import one_line
 
 SETTINGS = {"length_ns": 1600}
 # in the bulk; half in the lithium layer (the top 1 mm); all in it; all outside
@@ -138,12 +137,20 @@ def test_the_file_tells_how_it_was_made_and_keeps_its_hits(ppc, source, tmp_path
         ({"events": "FEP=5e3"}, "'5e3' is no number of events; give N or FEP=N,DEP=M"),
         ({"events": "many"}, "`events`: 'many' is no number of events"),
         ({"events": "0"}, "no event is wanted"),
+        ({"hits": "dead.npz"}, "none of 1 events gives a signal"),
+        ({"settings": ["diffusion_constant=hot"]}, "diffusion_constant: give a number above 0"),
+        ({"settings": ["diffusion_constant=0"]}, "diffusion_constant: give a number above 0"),
+        ({"settings": ["dt_ns=1.5"]}, "dt_ns must be a multiple"),
     ],
 )
-def test_events_that_cannot_be_simulated(ppc, tmp_path: Path, given: dict[str, str], said: str):
+def test_events_that_cannot_be_simulated(
+    ppc, tmp_path: Path, monkeypatch, given: dict[str, Any], said: str
+):
+    monkeypatch.chdir(tmp_path)
+    npz(tmp_path / "dead.npz", HITS[2:3])
     with pytest.raises(CpunetError, match=rf"^[^\n]*{said}[^\n]*$"):
-        simulate(tmp_path / "sim.lh5", detector=ppc, **given)
-    assert list(tmp_path.iterdir()) == []
+        simulate("sim.lh5", detector=ppc, **{"settings": SETTINGS} | given)
+    assert [file.name for file in tmp_path.iterdir()] == ["dead.npz"]
 
 
 def test_merging_keeps_energy_and_stops_at_the_lithium_layer(ppc):
@@ -153,18 +160,6 @@ def test_merging_keeps_energy_and_stops_at_the_lithium_layer(ppc):
     assert merged.edep_kev.tolist() == [400, 10, 50]
     assert merged.z_mm == pytest.approx([44.985, 20, 45.01])
     assert merged.offsets.tolist() == [0, 3, 3]
-
-
-def test_merging_within_a_twentieth_of_a_mm_changes_no_sample_by_a_permille(
-    ppc, tmp_path: Path
-):
-    out, merged = tmp_path / "exact.lh5", tmp_path / "merged.lh5"
-    how = {"detector": ppc, "events": "FEP=10,DEP=5", "seed": 4}
-    for file, cluster_mm in ((out, 0), (merged, 0.05)):
-        simulate(file, **how, settings=SETTINGS | {"cluster_mm": cluster_mm})
-    first, second = (next(open_pulses(path).blocks()) for path in (out, merged))
-    assert np.abs(first.waveforms - second.waveforms).max() < 1e-3
-    assert first.energy_kev == pytest.approx(second.energy_kev)
 
 
 def test_a_stray_hit_draws_no_warning_and_many_are_refused(ppc, source, tmp_path, caplog):
@@ -183,24 +178,3 @@ def test_a_stray_hit_draws_no_warning_and_many_are_refused(ppc, source, tmp_path
     )
     with pytest.raises(CpunetError, match=r"10 of 11 \(90.9%\) hits lie outside ppc .* move"):
         opened(1, 10)
-
-
-def test_no_event_with_a_signal(ppc, tmp_path: Path):
-    dead = HitFile(npz(tmp_path / "hits.npz", HITS[2:3]))
-    with pytest.raises(CpunetError, match="none of 1 events gives a signal"):
-        simulate(tmp_path / "sim.lh5", detector=ppc, hits=dead, settings=SETTINGS)
-    assert not (tmp_path / "sim.lh5").exists()
-
-
-def test_settings_and_what_is_wrong_with_them(tmp_path: Path):
-    assert SimulationSettings().diffusion_constant == 0.12
-    kept = SimulationSettings(diffusion_constant="temperature").model_dump(mode="json")
-    assert SimulationSettings.model_validate(kept).diffusion_constant == "temperature"
-    path = tmp_path / "settings.yaml"
-    for text, said in (
-        ("diffusion_constant: hot", "diffusion_constant: give a number above 0"),
-        ("diffusion_constant: 0", "diffusion_constant: give a number above 0"),
-        ("dt_ns: 1.5", "dt_ns must be a multiple"),
-    ):
-        path.write_text(text)
-        one_line(lambda: read_settings(SimulationSettings, path), f"{path}: ", said)

@@ -33,22 +33,9 @@ _MAPPINGS = (".yaml", ".yml", ".json")
 LIQUID_ARGON_K = 87.0  # around LEGEND's detectors, whose metadata tell no temperature
 _SIGGEN_BYTES = 1 << 16
 
-# siggen's names of fields of the detector; parts of the names, then whole names
+_KEYS: dict[str, Any] = read_values(Path(__file__).with_name("detector_keys.yaml"))
+# parts of siggen's names of fields of the detector
 _SIGGEN_PARTS = (("xtal_", "crystal_"), ("pc_", "point_contact_"), ("hole_", "bore_"))
-_SIGGEN_NAMES = {
-    "taper_angle": "taper_angle_deg",
-    "taper_length": "bottom_taper_length",
-    "Li_thickness": "li_thickness",
-    "impurity_z0": "impurity_z0_1e10_per_cm3",
-    "impurity_gradient": "impurity_gradient_1e10_per_cm4",
-    "impurity_quadratic": "impurity_quadratic_1e10_per_cm3",
-    "impurity_surface": "surface_charge_1e10_per_cm2",
-    "impurity_radial_add": "impurity_radial_add_1e10_per_cm3",
-    "impurity_rpower": "impurity_radial_power",
-    "xtal_HV": "bias_V",
-    "xtal_temp": "temperature_K",
-    "xtal_grid": "grid_mm",
-}
 # alternative or neutral values, and offsets of siggen's version in three dimensions
 _DERIVED = re.compile(
     "bore_length_gap|(outer|inner)_taper_width|bulletize_PC|(point_contact|bore)_offset_.*"
@@ -62,60 +49,7 @@ _NOT_OF_THE_DETECTOR = re.compile(
 )
 
 
-# keys of a diode and the fields of the detector
-_GEOMETRY = {
-    "height_in_mm": "crystal_length",
-    "radius_in_mm": "crystal_radius",
-    "pp_contact.radius_in_mm": "point_contact_radius",
-    "pp_contact.depth_in_mm": "point_contact_length",
-    "groove.depth_in_mm": "ditch_depth",
-    "groove.radius_in_mm.outer": "wrap_around_radius",
-    "groove.radius_in_mm.inner": "",
-    "borehole.radius_in_mm": "bore_radius",
-    "borehole.depth_in_mm": "bore_length",
-    "taper.top.height_in_mm": "outer_taper_length",
-    "taper.top.angle_in_deg": "taper_angle_deg",
-    "taper.borehole.height_in_mm": "inner_taper_length",
-    "taper.borehole.angle_in_deg": "inner_taper_angle_deg",
-    "taper.bottom.height_in_mm": "bottom_taper_length",
-    "taper.bottom.angle_in_deg": "bottom_taper_angle_deg",
-    "bulletization.top_radius_in_mm": "top_bullet_radius",
-    "bulletization.bottom_radius_in_mm": "bottom_bullet_radius",
-    "bulletization.borehole_radius_in_mm": "bore_bullet_radius",
-    "extra.topgroove.radius_in_mm": "top_groove_radius",
-    "extra.topgroove.depth_in_mm": "top_groove_depth",
-    "extra.top_cylinder.radius_in_mm": "top_cylinder_radius",
-    "extra.top_cylinder.height_in_mm": "top_cylinder_length",
-    "extra.bottom_cylinder.radius_in_mm": "bottom_cylinder_radius",
-    "extra.bottom_cylinder.height_in_mm": "bottom_cylinder_length",
-    "extra.bottom_cylinder.transition_in_mm": "bottom_transition_length",
-    "bulletization.pp-contact_radius_in_mm": "",
-    "bulletization.contact_radius_in_mm": "",
-}
-# fields of the detector and their locations; the first value above 0 is used
-_MEASURED = {
-    "bias_V": (
-        "characterization.l200_site.recommended_voltage_in_V",
-        "characterization.manufacturer.recommended_voltage_in_V",
-    ),
-    "measured_depletion_V": (
-        "characterization.l200_site.depletion_voltage_in_V",
-        "characterization.manufacturer.depletion_voltage_in_V",
-    ),
-    "li_thickness": (
-        "characterization.combined_0vbb_analysis.fccd_in_mm.value",
-        "characterization.manufacturer.dl_thickness_in_mm",
-    ),
-}
 _SIMULATED = ("icpc", "bege", "ppc")
-# parameters of each model of the impurity curve
-MODELS = {
-    "constant_boule": ("value",),
-    "linear_boule": ("a", "b"),
-    "parabolic_boule": ("a", "b", "c"),
-    "linear_exponential_boule": ("a", "b", "n", "l", "m"),
-    "parabolic_exponential_boule": ("a", "b", "c", "n", "l", "m"),
-}
 _ANOTHER = "correct it, or take another file of the crystal"
 _LARGEST_EXPONENT = 300
 
@@ -215,7 +149,7 @@ def siggen_values(text: str, name: str) -> dict[str, float]:
         if not words or line[0] in " \t" or _NOT_OF_THE_DETECTOR.fullmatch(words[0]):
             continue
         where = f"detector {name}: line {number}: {words[0]}"
-        key = _SIGGEN_NAMES.get(words[0], words[0]).replace("_diam", "_radius")
+        key = _KEYS["siggen"].get(words[0], words[0]).replace("_diam", "_radius")
         for theirs, ours in _SIGGEN_PARTS:
             key = key.replace(theirs, ours)
         if key not in Detector.model_fields and not _DERIVED.fullmatch(key):
@@ -312,16 +246,16 @@ def detector_values(
             "crystals are simulated; remove it to simulate the crystal without it"
         )
     values: dict[str, Any] = {"name": str(diode.get("name", Path(name).stem))}
-    reasons = {field: f"no geometry.{key}" for key, field in _GEOMETRY.items()}
+    reasons = {field: f"no geometry.{key}" for key, field in _KEYS["diode"].items()}
     for key, value in geometry.items():
         if key == "extra" or key.startswith("extra.crack"):
             continue
-        if key not in _GEOMETRY:
+        if key not in _KEYS["diode"]:
             raise CpunetError(
                 f"{source}: unknown key geometry.{key} (units belong to the key); "
                 "correct or remove it"
             )
-        values[_GEOMETRY[key]] = value
+        values[_KEYS["diode"][key]] = value
     values.pop("", None)
     outer, inner = (
         _number_at(diode, f"geometry.groove.radius_in_mm.{side}", source, 0.0)
@@ -329,7 +263,7 @@ def detector_values(
     )
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = outer - inner
-    for field, places in _MEASURED.items():
+    for field, places in _KEYS["measured"].items():
         reasons[field] = f"neither {' nor '.join(places)} is above 0"
         numbers = [_number_at(diode, place, source, 0.0) for place in places]
         if min(numbers) < 0:
@@ -391,17 +325,17 @@ def impurity_values(
     curve = crystal.get("impurity_curve")
     if not isinstance(curve, Mapping):
         raise CpunetError(f"{source}: no impurity_curve; {_ANOTHER}")
-    model = curve.get("model")
-    if not isinstance(model, str) or model not in MODELS:
+    model, models = curve.get("model"), _KEYS["impurity_curve"]
+    if not isinstance(model, str) or model not in models:
         raise CpunetError(
             f"{source}: impurity_curve.model {model!r} is unknown; models are "
-            f"{', '.join(MODELS)}; {_ANOTHER}"
+            f"{', '.join(models)}; {_ANOTHER}"
         )
     numbers = dict.fromkeys("abcn", 0.0) | {
         "a" if key == "value" else key: _number_at(
             crystal, f"impurity_curve.parameters.{key}", source
         )
-        for key in MODELS[model]
+        for key in models[model]
     }
     a, b, c, n = (numbers[key] for key in "abcn")
     place = f"slices.{slice_name}.detector_offset_in_mm"
