@@ -269,9 +269,8 @@ class Search:
         factor = scale**2 * of_weights(n, mean, len(vector))
         move, covariance = of_parts(jacobian, *parts, factor)
         problem.set(np.clip(problem.vector() + move, problem.low, problem.high))
-        (chi_before, pulls_before), (chi_after, pulls_after) = (
-            each.compared() for each in (replace(before, weights=problem.weights), problem)
-        )
+        chi_before, pulls_before = replace(before, weights=problem.weights).compared()
+        chi_after, pulls_after = problem.compared()
         chi = ChiSquare(
             before=chi_before,
             after=chi_after,

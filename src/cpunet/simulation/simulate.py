@@ -30,7 +30,7 @@ from cpunet.simulation.gammas import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.hit_files import HIT_TABLE, WINDOW_US, hit_columns, read_hits
 from cpunet.simulation.hits import HitOptions, Hits, OpenHits
-from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT
+from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT, places
 from cpunet.simulation.settings import SimulationSettings, detector_and_settings
 from cpunet.simulation.simulator import EventPulses, Simulator
 
@@ -279,9 +279,8 @@ class Simulation:
     def count(self, before_merging: int, events: EventPulses) -> None:
         """Count a block of events, and its hits before they were merged."""
         hits, collected = events.hits, events.collected_kev
-        place = hits.r_mm, hits.z_mm
-        inside = self.detector.inside(*place)
-        contacts = np.isin(self.detector.region(*place), (POINT_CONTACT, LI_CONTACT))
+        region, inside = places(self.detector, hits.r_mm, hits.z_mm)
+        contacts = np.isin(region, (POINT_CONTACT, LI_CONTACT))
         block: dict[str, Any] = {
             "events": len(hits),
             "events_written": int((collected > 0).sum()),
