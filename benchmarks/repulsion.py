@@ -18,14 +18,8 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.drift import (
-    FWHM_PER_SIGMA,
-    HOLE,
-    REPULSION_PER_KEV,
-    carrier_velocity,
-    cloud_after_step,
-    velocity_table,
-)
+from cpunet.simulation.drift import FWHM_PER_SIGMA, REPULSION_PER_KEV, cloud_after_step
+from cpunet.simulation.drift_maps import HOLE, carrier_velocity, velocity_table
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.simulator import merge_hits
 

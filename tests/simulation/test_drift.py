@@ -10,13 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from cpunet.simulation.drift import (
-    ELECTRON,
-    HOLE,
-    V100,
-    carrier_velocity,
-    velocity_table,
-)
+from cpunet.simulation.drift_maps import ELECTRON, HOLE, V100, carrier_velocity, velocity_table
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings

@@ -13,7 +13,7 @@ from scipy.cluster.hierarchy import fcluster, linkage
 from scipy.ndimage import gaussian_filter1d
 
 from cpunet.errors import CpunetError
-from cpunet.simulation.drift import ELECTRON, HOLE, carrier_velocity, velocity_table
+from cpunet.simulation.drift_maps import ELECTRON, HOLE, carrier_velocity, velocity_table
 from cpunet.simulation.fields import FieldMaps
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits

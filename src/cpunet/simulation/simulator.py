@@ -16,18 +16,14 @@ from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
 from cpunet.simulation.drift import (
     BOLTZMANN_V_PER_K,
-    ELECTRON,
     FWHM_PER_SIGMA,
-    HOLE,
     REPULSION_PER_KEV,
     SIGGEN_DIFFUSION,
     SMALLEST_FWHM_MM,
-    DriftMaps,
     drift,
-    drift_maps,
-    in_active_volume,
     smear_and_sample,
 )
+from cpunet.simulation.drift_maps import ELECTRON, HOLE, DriftMaps, drift_maps, in_active_volume
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import BoolArray, Detector, FloatArray, IntArray
 from cpunet.simulation.hits import Hits, OpenHits
@@ -195,7 +191,7 @@ class Simulator:
 
     >>> from types import SimpleNamespace
     >>> from cpunet.simulation.geometry_readers import read_detector
-    >>> from cpunet.simulation.drift import carrier_velocity, velocity_table
+    >>> from cpunet.simulation.drift_maps import carrier_velocity, velocity_table
     >>> height = np.tile(np.arange(11.0), (11, 1))  # z in mm
     >>> planar = SimpleNamespace(
     ...     grid_mm=1.0, potential_V=100 * height, weighting_potential=1 - height / 10,
