@@ -10,6 +10,7 @@ import numpy.typing as npt
 import pytest
 
 from cpunet.errors import CpunetError
+from cpunet.simulation.gamma_tables import electron_table, photon_table
 from cpunet.simulation.gammas import (
     HITS,
     LOST,
@@ -19,9 +20,7 @@ from cpunet.simulation.gammas import (
     Medium,
     UnitVector,
     compton_energy,
-    electron_table,
     follow_photons,
-    photon_table,
     put_photon,
     simulate_gammas,
 )
