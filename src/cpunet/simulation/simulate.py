@@ -28,7 +28,8 @@ from cpunet.recipes.schema import PeakConfig
 from cpunet.settings import Set, require_seed
 from cpunet.simulation.gammas import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
-from cpunet.simulation.hit_files import HIT_TABLE, WINDOW_US, hit_columns, read_hits
+from cpunet.simulation.hit_files import HIT_TABLE, hit_columns, read_hits
+from cpunet.simulation.hit_steps import WINDOW_US
 from cpunet.simulation.hits import HitOptions, Hits, OpenHits
 from cpunet.simulation.outline import LI_CONTACT, POINT_CONTACT, places
 from cpunet.simulation.settings import SimulationSettings, detector_and_settings
