@@ -2,45 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
-Array = npt.NDArray[np.float64]
 HEIGHT, BIAS = 10.0, 1000.0
 
 
-@dataclass(frozen=True, eq=False)
-class ToyMaps:
-    grid_mm: float
-    potential_V: Array
-    e_r_V_per_cm: Array
-    e_z_V_per_cm: Array
-    weighting_potential: Array
-    region: npt.NDArray[np.int8]
-
-
 @pytest.fixture(scope="session")
-def planar() -> ToyMaps:
+def planar() -> SimpleNamespace:
     """Contact at z = 2 mm (0 V), n+ at z = 12 mm (1000 V), 20 mm wide, uniform field."""
     grid = 0.5
-    _, z = np.meshgrid(
-        np.arange(0, 20 + grid, grid), np.arange(0, 14 + grid, grid), indexing="ij"
-    )
-    depth = np.clip((z - 2) / HEIGHT, 0, 1)
+    z = np.tile(np.arange(0, 14 + grid, grid), (round(20 / grid) + 1, 1))
     inside = (z >= 2) & (z <= 2 + HEIGHT)
-    field = np.where(inside, -10 * BIAS / HEIGHT, 0.0)
-    kinds = np.where(inside, 2, 1).astype(np.int8)
-    return ToyMaps(grid, BIAS * depth, 0 * field, field, 1 - depth, kinds)
+    depth = np.clip((z - 2) / HEIGHT, 0, 1)
+    return SimpleNamespace(
+        grid_mm=grid,
+        potential_V=BIAS * depth,
+        e_r_V_per_cm=0 * z,
+        e_z_V_per_cm=np.where(inside, -10 * BIAS / HEIGHT, 0.0),
+        weighting_potential=1 - depth,
+        region=np.where(inside, 2, 1).astype(np.int8),
+    )
 
 
 @pytest.fixture(scope="session")
-def reference_maps(reference_data: Path) -> ToyMaps:
+def reference_maps(reference_data: Path) -> SimpleNamespace:
     """Siggen's maps of its 0.1 mm solution, every 0.5 mm."""
+    names = {"potential_V": "V_01", "e_r_V_per_cm": "Er_01", "e_z_V_per_cm": "Ez_01"}
+    names |= {"weighting_potential": "WP_01", "region": "point_type"}
     with np.load(reference_data / "siggen" / "maps_A_outertaper.npz") as maps:
-        return ToyMaps(
-            0.5, maps["V_01"], maps["Er_01"], maps["Ez_01"], maps["WP_01"], maps["point_type"]
-        )
+        return SimpleNamespace(grid_mm=0.5, **{name: maps[key] for name, key in names.items()})
