@@ -111,8 +111,8 @@ def electron_table() -> ElectronTable:
     density = np.where(x < s["x0"], 0.0, 2 * np.log(10) * x - s["c"] + bend)
     form = 1 - beta2 + (tau**2 / 8 - (2 * tau + 1) * np.log(2)) / gamma**2
     logarithm = np.log(tau**2 * (tau + 2) / (2 * (_EXCITATION / ELECTRON_MASS) ** 2))
-    scale = 2 * np.pi * _RADIUS**2 * ELECTRON_MASS * _ATOMS * _Z / 10
-    collisions = scale / beta2 * (logarithm + form - density)
+    unit = 2 * np.pi * _RADIUS**2 * ELECTRON_MASS * _ATOMS * _Z / 10
+    collisions = unit / beta2 * (logarithm + form - density)
     most = np.minimum(middle, PHOTON_CUT)
     soft = _radiation(middle[:, np.newaxis], (np.arange(32) + 0.5) / 32 * most[:, np.newaxis])
     step = energy * _LOSS_PER_STEP / (collisions + soft.mean(axis=1) * most)
