@@ -61,7 +61,7 @@ def compare(folder: Path, fields: FieldMaps) -> None:
     print(f", worst {width.max():.1%} (one step); RMS {rms.max():.1e} at most")
     with np.load(folder / "drift_paths_A_grid0.1.npz") as reference:
         _, paths = plain_drift.paths(*reference["positions"].T)
-        theirs = reference["paths"][:, : PLAIN.n_steps]
+        theirs = reference["paths"][:, : PLAIN.n_samples]
         holes = np.nanmax(np.linalg.norm(paths - theirs[..., 3:], axis=2))
     print(f"  paths of holes within {holes:.3f} mm")
 

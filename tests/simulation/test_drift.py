@@ -36,13 +36,13 @@ def test_nothing_drifts_from_a_contact_or_from_outside(planar: FieldMaps, far: f
     paths = drift_paths(planar, [5.0, 5.0, far, 0.0], 0.0, [1.0, 13.0, 8.0, far])
     assert np.isnan(paths).all()
     _, holes = drift_paths(planar, 5.0, 3.0, 8.0)  # a single place is one path
-    assert holes.shape == (1, STEPS.n_steps, 3)
+    assert holes.shape == (1, STEPS.n_samples, 3)
     assert np.nanmin(holes[0, :, 2]) == pytest.approx(2, abs=0.1)
 
 
 def test_reference_paths(reference_data: Path, reference_maps: FieldMaps) -> None:
     with np.load(reference_data / "siggen" / "drift_paths_A_grid0.1.npz") as data:
-        start, expected = data["positions"], data["paths"][:, : STEPS.n_steps]
+        start, expected = data["positions"], data["paths"][:, : STEPS.n_samples]
     electrons, holes = drift_paths(reference_maps, *start.T)
     # the reference holds electrons first; it drifted in maps five times finer than these
     holes = np.linalg.norm(holes - expected[..., 3:], axis=2)

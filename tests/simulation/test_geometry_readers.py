@@ -68,9 +68,9 @@ def refused(path: Path | str, *overrides: str) -> str:
 def test_the_reference_geometry_is_the_example(reference_data: Path, tmp_path: Path) -> None:
     paths = reference_data / "siggen" / "geometry_A.yaml", tmp_path / "V1.config"
     paths[1].write_text(SIGGEN)
-    one, other = map(read_detector, paths)
-    assert one.fingerprint() == other.fingerprint() == read_detector("icpc").fingerprint()
-    assert other.name == "V1"
+    icpc = read_detector("icpc")
+    for path, name in zip(paths, ("geometry_A", "V1"), strict=True):
+        assert read_detector(path) == icpc.model_copy(update={"name": name})
 
 
 @pytest.mark.parametrize(

@@ -232,6 +232,7 @@ def drift_maps(
         ditch = ~_all_corners(~np.pad(np.kron(_all_corners(ditch), fine), 1))
         usable = np.kron(usable, fine)
     coefficients, per_field = velocity_table(temperature_K, settings)
+    per_us = settings.electron_trapping_per_us, settings.hole_trapping_per_us
     return DriftMaps(
         values=np.ascontiguousarray(values),
         usable=usable,
@@ -240,7 +241,7 @@ def drift_maps(
         bias_V=bias,
         coefficients=coefficients,
         fields_per_V_per_cm=per_field,
-        trapping_per_ns=np.array(settings.trapping_per_ns),
+        trapping_per_ns=np.array(per_us) / 1000,
     )
 
 

@@ -17,6 +17,8 @@ is not depleted, and the potential is refused.
 from __future__ import annotations
 
 import functools
+import hashlib
+import json
 import logging
 import math
 import os
@@ -79,7 +81,8 @@ def solve(detector: Detector) -> Potentials:
         If the grid is too fine.
     """
     folder = os.environ.get("CPUNET_CACHE") or platformdirs.user_cache_dir("cpunet")
-    key = detector.fingerprint(exclude=("name", *_NOT_IN_PARTS))
+    values = detector.model_dump(mode="json", exclude={"name", *_NOT_IN_PARTS})
+    key = hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]
     file = Path(folder) / "fields" / f"{key}-{SOLVER_VERSION}.npz"
     return solved(detector.model_copy(update=_NOT_IN_PARTS), file)
 

@@ -6,10 +6,8 @@ Cylindrical coordinates have their axis at r = 0. z = 0 is the face with the poi
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from itertools import chain
 from typing import Annotated
 
@@ -274,8 +272,3 @@ class Detector(Config):
         from cpunet.simulation.outline import places
 
         return places(self, r, z)[0]
-
-    def fingerprint(self, exclude: Iterable[str] = ("name",)) -> str:
-        """Hash of all values except those in `exclude`. Equal detectors have equal hashes."""
-        values = self.model_dump(mode="json", exclude=set(exclude))
-        return hashlib.sha256(json.dumps(values, sort_keys=True).encode()).hexdigest()[:24]

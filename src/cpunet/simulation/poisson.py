@@ -18,7 +18,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 import scipy.sparse as sp
 from scipy.constants import elementary_charge, epsilon_0
 from scipy.ndimage import label, minimum_filter
@@ -54,11 +53,6 @@ class Grid:
     region: RegionArray
     r_steps: FloatArray
     z_steps: FloatArray
-
-    @property
-    def free(self) -> npt.NDArray[np.bool_]:
-        """Nodes (nr, nz) with unknown potential: germanium and ditch."""
-        return np.asarray(self.region > LI_CONTACT)
 
 
 def make_grid(detector: Detector) -> Grid:
@@ -188,12 +182,13 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     >>> detector = read_detector("ppc", ["grid_mm=0.5"])
     >>> grid = make_grid(detector)
     >>> parts = solve_potentials(detector, grid)
-    >>> bool(abs(parts.weighting_potential + parts.bias - 1)[grid.free].max() < 1e-9)
+    >>> total = parts.weighting_potential + parts.bias
+    >>> bool(abs(total - 1)[grid.region >= GERMANIUM].max() < 1e-9)
     True
     """
     # conductances of the steps per unit angle in mm: area times permittivity over length
     # a step in r crosses the upper half of the cell below it and the lower of the one above
-    h, free, n_z = grid.grid_mm, grid.free, len(grid.z_mm)
+    h, n_z = grid.grid_mm, len(grid.z_mm)
     epsilon = 1 + (EPSILON_GERMANIUM - 1) * _germanium_in_cells(detector, grid)
     middle = (grid.r_mm[:-1] + grid.r_mm[1:]) / 2
     between = on_nodes(epsilon / 2, epsilon / 2, axis=1)
@@ -202,6 +197,7 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     z_flux = on_nodes(epsilon * inner[1:] / h, epsilon * outer[:-1] / h, axis=0) / grid.z_steps
     gap = detector.vacuum_gap
     to_ground = (inner + outer)[:, 0] / gap if gap else np.zeros(len(grid.r_mm))
+    free = grid.region > LI_CONTACT  # nodes with unknown potential: germanium and ditch
     above, below = np.pad(z_flux, ((0, 0), (0, 1))), np.pad(z_flux, ((0, 0), (1, 0)))
     diagonal = on_nodes(r_flux, r_flux, axis=0) + above + below
     diagonal[:, 0] += to_ground

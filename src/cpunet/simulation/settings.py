@@ -89,11 +89,6 @@ class SimulationSettings(Config):
     source_radius_mm: Annotated[float, Field(ge=0, le=1e4)] = 5.0
 
     @property
-    def n_steps(self) -> int:
-        """Time steps per record."""
-        return self.n_samples * self.steps_per_sample
-
-    @property
     def n_samples(self) -> int:
         """Samples per pulse."""
         return int(self.length_ns / self.dt_ns + 1e-9)
@@ -102,11 +97,6 @@ class SimulationSettings(Config):
     def steps_per_sample(self) -> int:
         """Time steps per sample."""
         return round(self.dt_ns / self.step_ns)
-
-    @property
-    def trapping_per_ns(self) -> tuple[float, float]:
-        """Trapping rates of electrons and holes in 1/ns."""
-        return self.electron_trapping_per_us / 1000, self.hole_trapping_per_us / 1000
 
     @field_validator("diffusion_constant", mode="before")
     @classmethod

@@ -406,7 +406,7 @@ def simulate(
                 "lost_energy": (block.lost_kev[seen], "keV"),
                 "n_hits": (np.diff(block.hits.offsets)[seen], ""),
             }
-            if any(physics.trapping_per_ns):
+            if physics.electron_trapping_per_us or physics.hole_trapping_per_us:
                 columns["trapped_energy"] = (block.trapped_kev[seen], "keV")
             writer.append(block.pulses(), columns)
             writer.append_rows(HIT_TABLE, hit_columns(block.hits[seen]))

@@ -329,7 +329,8 @@ class Simulator:
         """
         start = np.stack(np.broadcast_arrays(x_mm, y_mm, z_mm), axis=-1).astype(np.float64)
         start = start.reshape(-1, 3)
-        n_steps, step_ns = self.settings.n_steps, self.settings.step_ns
+        settings = self.settings
+        n_steps, step_ns = settings.n_samples * settings.steps_per_sample, settings.step_ns
         paths, signal = np.full((2, len(start), n_steps, 3), np.nan), np.zeros(n_steps)
         for i, (x, y, z) in enumerate(start.tolist()):
             if in_active_volume(self._maps, x, y, z):
