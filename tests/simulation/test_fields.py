@@ -60,19 +60,10 @@ def test_agrees_with_the_reference_simulator(reference_data: Path) -> None:
 def test_the_examples_are_depleted(name: str) -> None:
     detector = read_detector(name, COARSE)
     maps = compute_fields(detector)
-    shape = (len(maps.r_mm), len(maps.z_mm))
-    assert maps.potential_V.shape == maps.region.shape == shape
     assert 0 < maps.depletion_V < detector.bias_V
     assert maps.potential_V.min() == 0
-    assert maps.potential_V.max() == pytest.approx(detector.bias_V)
-    assert maps.weighting_potential.max() == pytest.approx(1)
-    assert maps.weighting_potential.min() > -1e-12
     assert (maps.potential_V[maps.region == 1] == detector.bias_V).all()
     assert (maps.weighting_potential[maps.region == 0] == 1).all()
-    # far from any contact, the field is minus the slope of the potential
-    i, j = np.argwhere(maps.region == 2).mean(axis=0).astype(int)
-    slope = maps.potential_V[i + 1, j] - maps.potential_V[i - 1, j]
-    assert maps.e_r_V_per_cm[i, j] == pytest.approx(-10 * slope / (2 * maps.grid_mm))
 
 
 def test_an_undepleted_detector_is_refused() -> None:
