@@ -89,8 +89,7 @@ class Search:
         few = [sides.of(training.search_pulses) for sides in self._sides]
         self._chain = fit_chain(copy.deepcopy(start), few, Fitter(training)).response
         # of a chain, pulses near a point, free coordinates, and functions
-        of_chain = {"recipe": recipe, "start": start, "knowledge": knowledge}
-        self._problem = partial(JointProblem, **of_chain)
+        self._problem = partial(JointProblem, recipe=recipe, start=start, knowledge=knowledge)
         # of a usual search: derivatives take two each, of the first parameters, and of all
         self.simulations = USUAL_ROUNDS + 3 + 2 * (len(self._first) + len(self._all))
 
