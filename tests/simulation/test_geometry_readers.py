@@ -266,6 +266,10 @@ def test_diodes_that_cannot_be_simulated(tmp_path, change: dict[str, Any], said:
     assert said in refused(written(tmp_path, "B.json", json.dumps(diode)), "temperature_K=90")
 
 
+TAPERED = "outer_taper_length 20\nouter_taper_width 4\ninner_taper_length 45"
+RADIAL = "impurity_radial_add -0.4\nimpurity_radial_mult 1.5"
+
+
 def siggen(folder: Path, more: str = "", without: str = "#") -> Detector:
     """The detector of the configuration, with lines added at its end or left out."""
     lines = [line for line in SIGGEN.splitlines() if not line.startswith(without)]
@@ -294,29 +298,19 @@ def siggen(folder: Path, more: str = "", without: str = "#") -> Detector:
         ("pc_offset_x 0\nhole_offset_y_top 0.0", "#", "bore_radius", 5),
         # no ditch: a wrap-around as far as the wall, or further, is none
         ("wrap_around_radius 40.45", "ditch", "wrap_around_radius", 0),
+        # widths of tapers count where the angle is 0; that of one is not that of the other
+        (f"{TAPERED}\ninner_taper_width 2", "taper_angle", "taper_slopes", (0.2, 2 / 45, 1)),
+        (TAPERED, "taper_angle", "taper_slopes", (0.2, 0, 1)),
+        (f"{TAPERED}\ntaper_angle 5", "#", "taper_slopes", (0.0874887, 0.0874887, 1)),
+        # radial terms need a power
+        (RADIAL, "#", "impurity_radial_add_1e10_per_cm3", 0),
+        (f"{RADIAL}\nimpurity_rpower 0", "#", "impurity_radial_mult", 1),
+        (f"{RADIAL}\nimpurity_rpower 2", "#", "impurity_radial_add_1e10_per_cm3", -0.4),
+        (f"{RADIAL}\nimpurity_rpower 2", "#", "impurity_radial_mult", 1.5),
     ],
 )
 def test_siggens_own_rules(tmp_path, more, without, field, value) -> None:
     assert getattr(siggen(tmp_path, more, without), field) == pytest.approx(value)
-
-
-def test_widths_of_tapers_count_where_the_angle_is_0(tmp_path: Path) -> None:
-    more = "taper_angle 0\nouter_taper_length 20\nouter_taper_width 4\n"
-    more += "inner_taper_length 45\ninner_taper_width 2"
-    assert siggen(tmp_path, more).taper_slopes[:2] == pytest.approx((4 / 20, 2 / 45))
-    slopes = siggen(tmp_path, more.replace("angle 0", "angle 5")).taper_slopes[:2]
-    assert np.degrees(np.arctan(slopes)) == pytest.approx(5)
-    # a width of one taper is not that of the other
-    assert siggen(tmp_path, more.rpartition("\n")[0]).taper_slopes[1] == 0
-
-
-def test_radial_terms_need_a_power(tmp_path: Path) -> None:
-    radial = "impurity_radial_add -0.4\nimpurity_radial_mult 1.5"
-    for more in (radial, f"{radial}\nimpurity_rpower 0"):
-        assert siggen(tmp_path, more).impurity_1e10_per_cm3(40.45, 0) == pytest.approx(-1.8)
-    found = siggen(tmp_path, f"{radial}\nimpurity_rpower 2")
-    found = found.impurity_1e10_per_cm3([0, 40.45], 0)
-    assert found == pytest.approx([-1.8, -1.8 * 1.5 - 0.4])
 
 
 def test_what_was_cut_is_said(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
