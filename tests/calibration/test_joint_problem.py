@@ -269,7 +269,8 @@ def laid_over(pulses, others):
 
 
 def test_small_changes_are_those_of_a_simulation(simulator):
-    nearby = Nearby.about(simulator, np.zeros(3)).again(range(3))
+    at = np.zeros(3)
+    nearby = Nearby(simulator, at, simulator(at)).again(range(3))
     there = np.array([0.4, -0.008, 0.3])
     exact = simulator(there)
     near = nearby.at(there)
@@ -281,9 +282,10 @@ def test_small_changes_are_those_of_a_simulation(simulator):
 def test_derivatives_follow_the_edge(simulator):
     """Edges of a warmer detector are later, and self-repulsion smears them there."""
     warmer = np.array([0.5, 0.0, 0.0])
-    fresh = Nearby.about(simulator, warmer).again([2])
-    before = Nearby.about(simulator, np.zeros(3)).again([2])
-    nearby = Nearby.about(simulator, warmer, before.derivatives)
+    before, fresh = (
+        Nearby(simulator, at, simulator(at)).again([2]) for at in (0 * warmer, warmer)
+    )
+    nearby = replace(fresh, derivatives=before.derivatives)
     late = nearby.half - nearby.derivatives[2].half
     assert late.max() > 0.3  # samples
     far = np.argmax(late)

@@ -13,7 +13,7 @@ contains the start time of a pulse. Derivatives from another point are moved wit
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -126,14 +126,7 @@ class Nearby:
     simulator: Simulator
     centre: Values
     base: FloatArray
-    derivatives: Mapping[int, Derivative]
-
-    @classmethod
-    def about(
-        cls, simulator: Simulator, centre: Values, derivatives: Mapping[int, Derivative] = {}
-    ) -> Nearby:
-        """Simulate pulses at a point; derivatives may be from other points."""
-        return cls(simulator, centre, simulator(centre), derivatives)
+    derivatives: Mapping[int, Derivative] = field(default_factory=dict)
 
     def again(self, of: Sequence[int], most: int | None = None) -> Nearby:
         """The same point, with some derivatives simulated anew for the first `most` events.

@@ -95,9 +95,8 @@ class Search:
 
     def plan(self) -> Linear:
         """What the pulses say of all parameters that may become free, before a fit."""
-        few = first(self._functions)
-        nearby = Nearby.about(self.simulator, self._simulated)
-        nearby = nearby.again(self._all, events(few))
+        few, at = first(self._functions), self._simulated
+        nearby = Nearby(self.simulator, at, self.simulator(at)).again(self._all, events(few))
         return self._looked(self._problem(self._chain, nearby, self._all, few))
 
     def run(self) -> tuple[JointProblem, CalibratedPhysics]:
@@ -108,8 +107,8 @@ class Search:
         CpunetError
             If pulses cannot be simulated for the detector as given.
         """
-        nearby = Nearby.about(self.simulator, self._simulated).again(self._first)
-        response = self._chain
+        at, response = self._simulated, self._chain
+        nearby = Nearby(self.simulator, at, self.simulator(at)).again(self._first)
         before = self._problem(response, nearby, [], self._functions, held=True)
         chi_square, _ = before.compared()
         self._tell("as simulated", before, chi_square)
@@ -118,7 +117,7 @@ class Search:
             self._tell("without deviations", problem, end.chi_square)
             response = self._deviated(before, chi_square) or response
             problem, end = self._from_far(response, nearby)
-        free, more, last = list(problem.free), 0, self._simulated
+        free, more, last = list(problem.free), 0, at
         for number in range(1, ROUNDS + 1):
             if number > 1:
                 problem = self._problem(response, nearby, free, self._functions)
@@ -200,7 +199,8 @@ class Search:
         move = np.clip(moved, -farthest, farthest)
         for _ in range(HALVINGS):
             try:
-                place = Nearby.about(self.simulator, nearby.centre + move, nearby.derivatives)
+                at = nearby.centre + move
+                place = replace(nearby, centre=at, base=self.simulator(at))
                 break
             except CpunetError as error:  # for example, if the detector is not depleted
                 log.info(f"{error}; going half as far")
