@@ -105,8 +105,6 @@ _SCALES: dict[str, tuple[Callable[[float], float], Callable[[float], float]]] = 
     "factor": (math.log, math.exp),
     "square": (lambda value: value**2, lambda square: math.sqrt(max(0.0, square))),
 }
-# Parameters that are uncertain for any detector come first and are considered first. The others
-# are used only if these do not explain the data.
 _TABLE: dict[str, dict[str, Any]] = read_values(Path(__file__).with_name("nuisances.yaml"))
 NUISANCES = tuple(Nuisance(name=name, **row) for name, row in _TABLE.items())
 
