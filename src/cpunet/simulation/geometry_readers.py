@@ -101,8 +101,7 @@ def read_detector(path: str | Path | Detector, overrides: Set = ()) -> Detector:
             values["temperature_K"] = LIQUID_ARGON_K
             log.info(f"{name}: tells no temperature; {LIQUID_ARGON_K:g} K, as in liquid argon")
     values |= given
-    by_depletion = values.get("impurity_scale") == "depletion"
-    if by_depletion:
+    if by_depletion := values.get("impurity_scale") == "depletion":
         del values["impurity_scale"]
     missing = {
         key: f"missing ({why}); give `settings` {key}=VALUE" for key, why in hints.items()
@@ -210,10 +209,10 @@ def _fit(values: dict[str, float], name: str) -> None:
             own_angle = math.degrees(math.atan(widths[side] / length))
             if not math.isclose(own_angle, angle or math.nan):
                 values[field] = own_angle
-    flat_radius = values.get("crystal_radius", math.inf) - values.get(
-        "bottom_taper_length", 0.0
-    )
-    if around >= flat_radius and not values.get("ditch_depth"):
+    taper = values.get("bottom_taper_length", 0.0)
+    if around >= values.get("crystal_radius", math.inf) - taper and not values.get(
+        "ditch_depth"
+    ):
         values["wrap_around_radius"] = 0.0  # no wrap-around: lithium ends at the wall
 
 
