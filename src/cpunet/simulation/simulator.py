@@ -65,11 +65,8 @@ def merge_hits(hits: Hits, distance_mm: float, detector: Detector | None = None)
     """
     if distance_mm == 0:
         return hits
-    position, energy, alone = (
-        hits.position_mm,
-        hits.edep_kev,
-        np.zeros(len(hits.edep_kev), bool),
-    )
+    position, energy = hits.position_mm, hits.edep_kev
+    alone = np.zeros(len(energy), np.bool_)
     if detector is not None:
         alone = ~detector.active(hits.r_mm, hits.z_mm)
         order = np.lexsort((alone, hits.event_of_hit))  # the last hits of each event
