@@ -308,6 +308,16 @@ class Plan(InfoPart):
     errors_by_name: dict[str, ExpectedErrors]
     directions: dict[str, list[Direction]]
 
+    @property
+    def errors(self) -> DataFrame:
+        """Expected errors: a row per parameter and kind, a column per number of pulses."""
+        from pandas import DataFrame
+
+        rows: dict[tuple[str, str], dict[str, float]] = {}
+        for name, of in self.errors_by_name.items():
+            rows |= {(name, "alone"): of.alone, (name, "all_free"): of.all_free}
+        return DataFrame.from_dict(rows, orient="index")
+
     def plot(self) -> Figure:
         """Draw the directions with a middling number of pulses."""
         return directions_figure(self.directions[MIDDLE])
