@@ -9,9 +9,14 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cpunet.electronics.baseline_methods import BaselineMethod
+from cpunet.electronics.baseline_methods import (
+    BASELINE_METHODS,
+    LEAD_NS,
+    BaselineMethod,
+    crossing,
+    gauss_exp,
+)
 from cpunet.electronics.finishing import finish, record_length
-from cpunet.electronics.superpulses import BASELINE_METHODS, LEAD_NS, crossing, gauss_exp
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
