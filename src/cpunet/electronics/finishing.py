@@ -13,7 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.parameters import tail_slope
@@ -114,7 +113,7 @@ def finish(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: BaselineNoise | TraceNoise | None = None,
+    noise: BaselineNoise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
     added: npt.NDArray[np.float64] | None = None,

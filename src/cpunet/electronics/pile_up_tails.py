@@ -301,8 +301,9 @@ class PileUpTails:
         if len(gains) < MIN_BASELINES:
             reasons = "".join(f", {n} {reason}" for reason, n in prepared.rejections.items())
             raise CpunetError(
-                f"only {len(gains)} of {len(baselines)} traces can be prepared and have a known "
-                f"energy{reasons}; {MIN_BASELINES} or more are needed to tell pile-up tails"
+                f"only {len(gains)} of {len(baselines)} traces can be prepared and have a "
+                f"known energy{reasons}; {MIN_BASELINES} or more are needed to tell pile-up "
+                "tails"
             )
         if samples < MIN_SAMPLES:
             raise CpunetError(

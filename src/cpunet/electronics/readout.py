@@ -223,48 +223,6 @@ def coloured_noise(
     return noise
 
 
-def draw_other_pulses(
-    pulses: Pulses, electronics: Electronics, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, InTracePileUp]:
-    """Draw the other pulses of each trace, see `cpunet.electronics.chain`.
-
-    Parameters
-    ----------
-    pulses
-        Pulses of the traces. Piled-up pulses take their shapes.
-    electronics
-        The readout chain with the rates.
-    rng
-        Random generator.
-
-    Returns
-    -------
-    tuple
-        Signal in keV that is added to each trace, shape ``(n, length)``; sum of the pile-up
-        tails at the first sample of each, in keV; piled-up pulses in the traces.
-    """
-    tails, within = rng.spawn(2)
-    # pile-up tails with all decays of the chain: a step response is a sum of exponentials, and
-    # so is the sum of many tails
-    n, transfer, dt_ns = len(pulses), electronics.transfer, electronics.dt_ns
-    longest_us = LIFETIMES * max(part.tau_us for part in electronics.decays)
-    rate_khz, energies_kev = electronics.earlier_pulses.rate_kHz, electronics.other_pulses_kev
-    row, kev, before_us = earlier_pulses(n, rate_khz, longest_us, energies_kev, tails)
-    modes = kev[:, np.newaxis] * np.exp(1e3 * before_us[:, np.newaxis] * transfer.poles)
-    heights = np.zeros((n, len(transfer.poles)), np.complex128)
-    np.add.at(heights, row, modes * (transfer.residues / transfer.poles))
-    centres_ns = (np.arange(electronics.length) + 0.5) * dt_ns
-    decays = np.exp(transfer.poles[:, np.newaxis] * centres_ns)
-    added_kev = np.ascontiguousarray((heights @ decays).real)
-    tails_kev = added_kev[:, 0].copy()  # before piled-up pulses are added
-    rate_khz, record = electronics.pile_up.rate_kHz, (electronics.n_pre, electronics.length)
-    piled = InTracePileUp.draw(n, rate_khz, energies_kev, dt_ns, *record, within)
-    # with shapes of randomly chosen pulses
-    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
-    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
-    return added_kev, tails_kev, piled
-
-
 FLAGS = {"decaying baseline": 1, "pile-up": 2, "saturated": 4}
 """Bits of a trace's flags. A baseline decays if its tail exceeds the noise RMS."""
 
@@ -354,17 +312,38 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     >>> traces.waveforms.shape, traces.waveforms.dtype
     ((2, 1400), dtype('uint16'))
     """
-    energy, n = pulses.energy_kev, len(pulses)
+    energy, n, transfer = pulses.energy_kev, len(pulses), electronics.transfer
+    dt_ns, length, n_pre = electronics.dt_ns, electronics.length, electronics.n_pre
     require_energies(energy, pulses.event_number)
     clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
     # a uniform clock phase plus trigger jitter
-    shift_ns = clock.uniform(0, electronics.dt_ns, size=n)
+    shift_ns = clock.uniform(0, dt_ns, size=n)
     shift_ns += clock.normal(0, electronics.trigger_jitter_ns, size=n)
     response = linear_response(pulses, electronics, shift_ns)
-    added_kev, tails_kev, piled = draw_other_pulses(pulses, electronics, others)
+
+    # pile-up tails with all decays of the chain: a step response is a sum of exponentials, and
+    # so is the sum of many tails
+    tails, within = others.spawn(2)
+    longest_us = LIFETIMES * max(part.tau_us for part in electronics.decays)
+    rate_khz, energies_kev = electronics.earlier_pulses.rate_kHz, electronics.other_pulses_kev
+    row, kev, before_us = earlier_pulses(n, rate_khz, longest_us, energies_kev, tails)
+    modes = kev[:, np.newaxis] * np.exp(1e3 * before_us[:, np.newaxis] * transfer.poles)
+    heights = np.zeros((n, len(transfer.poles)), np.complex128)
+    np.add.at(heights, row, modes * (transfer.residues / transfer.poles))
+    centres_ns = (np.arange(length) + 0.5) * dt_ns
+    decays = np.exp(transfer.poles[:, np.newaxis] * centres_ns)
+    added_kev = np.ascontiguousarray((heights @ decays).real)
+    tails_kev = added_kev[:, 0].copy()  # before piled-up pulses are added
+
+    # in-trace pile-up, with shapes of randomly chosen pulses
+    rate_khz = electronics.pile_up.rate_kHz
+    piled = InTracePileUp.draw(n, rate_khz, energies_kev, dt_ns, n_pre, length, within)
+    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
+    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
     n_piled, piled_kev, piled_ns = (values for values, _ in piled.columns().values())
-    own, dt_ns = electronics.noise, electronics.dt_ns
-    unit = coloured_noise(own.spectrum, n, electronics.length, dt_ns, noise)
+
+    own = electronics.noise
+    unit = coloured_noise(own.spectrum, n, length, dt_ns, noise)
     total_kev = energy[:, None] * response + added_kev + unit * np.float32(own.rms_kev)
     total_kev = by_height(total_kev, electronics)
     mean, spread = electronics.baseline_mean_adc, electronics.baseline_spread_adc
