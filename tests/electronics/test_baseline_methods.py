@@ -71,6 +71,13 @@ def gauss_exp_kernel(sigma_ns: float, tau_ns: float) -> np.ndarray:
     return np.convolve(gauss, np.exp(-time / tau_ns))
 
 
+def rc_late_kernel(tau_ns: float, late_share: float, late_ns: float) -> np.ndarray:
+    time = np.arange(0, 6000, FINE_NS)
+    late = late_share * np.exp(-time / late_ns) / late_ns
+    late[0] += (1 - late_share) / FINE_NS
+    return np.convolve(np.exp(-time / tau_ns) / tau_ns, late)[: len(time)]
+
+
 def simulated(fine: FloatArray) -> FloatArray:
     return prepare(Pulses.of(sampled(fine), dt_ns=DT_NS), CONFIG, "simulated").pulses.waveforms
 
@@ -92,17 +99,25 @@ def other_fine() -> FloatArray:
     return ideal(800, seed=2)
 
 
+RC_LATE = {"tau_ns": (60, 0.1), "late_share": (0.07, 0.2), "late_ns": (500, 0.35)}
+NARROW, WIDE = ({"sigma_ns": (s, 0.03), "tau_ns": (t, 0.03)} for s, t in ((30, 60), (20, 90)))
+
+
 @pytest.mark.parametrize(
-    ("sigma_ns", "tau_ns"), [(30.0, 60.0), pytest.param(20.0, 90.0, marks=pytest.mark.thorough)]
+    ("name", "kernel", "wanted"),
+    [
+        ("gauss_exp", gauss_exp_kernel, NARROW),
+        pytest.param("gauss_exp", gauss_exp_kernel, WIDE, marks=pytest.mark.thorough),
+        ("rc_late", rc_late_kernel, RC_LATE),
+    ],
 )
-def test_gauss_exp_recovers_its_widths(sim, other_fine, sigma_ns, tau_ns) -> None:
-    response = sampled(convolved(other_fine, gauss_exp_kernel(sigma_ns, tau_ns)))
-    method = BASELINE_METHODS["gauss_exp"](
-        sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN
-    )
-    assert method.values["sigma_ns"] == pytest.approx(sigma_ns, rel=0.03)
-    assert method.values["tau_ns"] == pytest.approx(tau_ns, rel=0.03)
-    assert method.tail_slope_per_ms == pytest.approx(-1e6 / DECAY_NS, rel=0.01)
+def test_kernels_are_recovered(sim, other_fine, name, kernel, wanted) -> None:
+    response = sampled(convolved(other_fine, kernel(*(value for value, _ in wanted.values()))))
+    data = measured(decayed(response, DT_NS))
+    found = BASELINE_METHODS[name](sim, data, DT_NS, ALIGN).values
+    for value, (true, error) in wanted.items():
+        assert found[value] == pytest.approx(true, rel=error)
+    assert found["tail_slope_per_ms"] == pytest.approx(-1e6 / DECAY_NS, rel=0.01)
 
 
 @pytest.mark.parametrize("tau_ns", [DT_NS, 50.0, 100.0])
@@ -144,7 +159,8 @@ def test_windows_are_those_of_the_true_response(sigma_ns: float, tau_ns: float) 
     true = sampled(convolved(fine, gauss_exp_kernel(sigma_ns, tau_ns)))
     truth = finish(decayed(true, DT_NS), CONFIG, dt_ns=DT_NS).windows
     s = 2j * np.pi * scipy.fft.rfftfreq(record_length(CONFIG.length, DT_NS), DT_NS)
-    method = BaselineMethod(DT_NS, -1e6 / DECAY_NS, gauss_exp(s, sigma_ns, tau_ns), {})
+    decay = {"tail_slope_per_ms": -1e6 / DECAY_NS}
+    method = BaselineMethod(DT_NS, gauss_exp(s, sigma_ns, tau_ns), decay)
     windows = finish(method.translate(simulated(fine)), CONFIG, dt_ns=DT_NS).windows
     scores = paired_scores(windows, truth, 100)
     # What a response computed at 16 ns instead of on the fine grid costs: up to 5.0e-4
@@ -159,15 +175,3 @@ def test_bad_input_is_named(sim) -> None:
             method(sim[:7], sim, DT_NS, ALIGN)
     with pytest.raises(CpunetError, match="check their polarity"):
         BASELINE_METHODS["rc"](sim, -sim, DT_NS, ALIGN)
-
-
-def test_rc_with_late_charge_recovers_its_parts(sim, other_fine) -> None:
-    time = np.arange(0, 6000, FINE_NS)
-    kernel = np.convolve(
-        np.exp(-time / 60) / 60, 0.93 * (time == 0) / FINE_NS + 0.07 * np.exp(-time / 500) / 500
-    )[: len(time)]
-    data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
-    found = BASELINE_METHODS["rc_late"](sim, data, DT_NS, ALIGN)
-    assert found.values["tau_ns"] == pytest.approx(60, rel=0.1)
-    assert found.values["late_share"] == pytest.approx(0.07, abs=0.015)
-    assert found.values["late_ns"] == pytest.approx(500, rel=0.35)

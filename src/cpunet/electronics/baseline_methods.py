@@ -419,10 +419,7 @@ def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
         kernel /= kernel.sum()
         around_zero = np.roll(np.pad(kernel, (0, length - len(kernel))), -lead)
         transfer = np.asarray(scipy.fft.rfft(around_zero))
-    time_ns = np.arange(len(kernel)) * dt_ns
-    mean_ns = float(kernel @ time_ns)
-    rms_ns = float(np.sqrt((kernel @ (time_ns - mean_ns) ** 2).clip(min=0.0)))
-    return transfer, {"kernel_mean_ns": mean_ns - LEAD_NS, "kernel_rms_ns": rms_ns}
+    return transfer, {}
 
 
 # Where parameters start, their largest values, and their scales.
