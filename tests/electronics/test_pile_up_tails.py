@@ -77,13 +77,14 @@ def found(busy: RawTraces) -> PileUpTails:
 
 def test_each_trace_has_its_tail(busy: RawTraces, found: PileUpTails):
     np.testing.assert_allclose(found.measure(as_pulses(busy)), found.kev, atol=1e-9)
-    alone = np.isfinite(found.kev) & (busy.n_piled == 0)
-    off = (found.kev - busy.tails_kev)[alone & (busy.tails_kev < 50)]
+    tails_kev = busy.disturbed["tails_kev"]
+    alone = np.isfinite(found.kev) & (busy.disturbed["n_piled"] == 0)
+    off = (found.kev - tails_kev)[alone & (tails_kev < 50)]
     assert abs(np.median(off)) < 0.3
     assert 1.4826 * np.median(np.abs(off)) == pytest.approx(found.fit.sigma_kev, rel=0.1)
-    large = alone & (busy.tails_kev > 100)
+    large = alone & (tails_kev > 100)
     # heights of pulses, not their charge, are the scale: 1.5 % less of `ornl`
-    assert np.median(found.kev[large] / busy.tails_kev[large]) == pytest.approx(1, abs=0.02)
+    assert np.median(found.kev[large] / tails_kev[large]) == pytest.approx(1, abs=0.02)
     assert alone.mean() > 0.9
 
 
@@ -125,14 +126,15 @@ def test_levels_that_tell_nothing_are_left_out():
     found = PileUpTails.of(Baselines.of(blocks, PREPARATION))
     assert not found.level_weight
     assert found.describe().told_by == "slope"
-    large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.tails_kev > 100)
-    ratio = np.median(found.kev[large] / busy.tails_kev[large])
-    assert ratio == pytest.approx(1, abs=0.1)
+    tails_kev, sigma_kev = busy.disturbed["tails_kev"], found.fit.sigma_kev
+    known = np.isfinite(found.kev)
+    large = known & (busy.disturbed["n_piled"] == 0) & (tails_kev > 100)
+    assert np.median(found.kev[large] / tails_kev[large]) == pytest.approx(1, abs=0.1)
     # noise is measured where slopes are negative: it has all its power, and few tails
     empty = found.empty(blocks[0])
-    assert (busy.tails_kev[empty] > found.fit.sigma_kev).mean() < 0.05
-    told = np.isfinite(found.kev) & (busy.tails_kev < 0.2 * found.fit.sigma_kev)
-    square, alone = found.kev[told & empty] ** 2, found.kev[told] ** 2
+    assert (tails_kev[empty] > sigma_kev).mean() < 0.05
+    little = known & (tails_kev < 0.2 * sigma_kev)
+    square, alone = found.kev[little & empty] ** 2, found.kev[little] ** 2
     assert square.mean() == pytest.approx(alone.mean(), rel=0.15)
 
 
@@ -200,7 +202,7 @@ def test_what_passes_is_measured_by_adding_tails_to_traces_without():
     assert passed[0] == 1
     assert passed[-1] == 0
     drawn = DrawnTails(**asdict(found.fit.law), height=0.9, lead_us=0, dt_ns=16, passed=passed)
-    kev, true = drawn.draw_kev(20_000, rng), traces.tails_kev[kept.index]
+    kev, true = drawn.draw_kev(20_000, rng), traces.disturbed["tails_kev"][kept.index]
     for size in (3, 10, 20):
         assert (kev > size).mean() == pytest.approx((true > size).mean(), abs=0.02)
     assert passing(found, raw[:5], PREPARATION, cuts) is None

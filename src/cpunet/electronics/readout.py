@@ -233,30 +233,23 @@ class RawTraces(Pulses):
 
     Parameters
     ----------
-    flag
-        Uint8 sum of 1 (decaying baseline), 2 (pile-up) and 4 (saturated).
     response
         Noise-free pulses at their own clock phase in units of the full charge, without
         baseline and without earlier or piled-up pulses. Float32, shape ``(n, length)``.
     true_energy_kev, baseline_adc
         Scale in keV and offset in ADC counts of each pulse.
-    tails_kev
-        Sum of the pile-up tails at the first sample of each trace, in keV.
-    n_piled
-        Number of additional pulses within each trace.
-    piled_kev, piled_ns
-        Energy of the largest additional pulse, and its start after that of the trace's own
-        pulse in ns (negative: before it). NaN where there is none.
+    disturbed
+        How each trace is disturbed, arrays of shape ``(n,)``. ``flag``: uint8 sum of 1
+        (decaying baseline), 2 (pile-up) and 4 (saturated); ``tails_kev``: sum of the pile-up
+        tails at the first sample; ``n_piled``: number of additional pulses within the trace;
+        ``piled_kev``, ``piled_ns``: energy of the largest of these, and its start after that
+        of the trace's own pulse (negative: before it), NaN where there is none.
     """
 
-    flag: npt.NDArray[np.uint8]
     response: npt.NDArray[np.float32]
     true_energy_kev: FloatArray
     baseline_adc: FloatArray
-    tails_kev: FloatArray
-    n_piled: npt.NDArray[np.int64]
-    piled_kev: FloatArray
-    piled_ns: FloatArray
+    disturbed: dict[str, npt.NDArray[Any]]
 
 
 def by_height(
@@ -340,7 +333,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     piled = InTracePileUp.draw(n, rate_khz, energies_kev, dt_ns, n_pre, length, within)
     shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
     np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
-    n_piled, piled_kev, piled_ns = (values for values, _ in piled.columns().values())
+    disturbed = {name: values for name, (values, _) in piled.columns().items()}
+    disturbed["piled_ns"] -= shift_ns
 
     own = electronics.noise
     unit = coloured_noise(own.spectrum, n, length, dt_ns, noise)
@@ -350,7 +344,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     baseline = level.normal(mean, spread, size=n)
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
-    flags = tails_kev > own.rms_kev, n_piled > 0, beyond.any(axis=1)
+    flags = tails_kev > own.rms_kev, disturbed["n_piled"] > 0, beyond.any(axis=1)
+    flag = np.asarray([*FLAGS.values()] @ np.array(flags), np.uint8)
     # the resolution grows with the root of the energy
     fwhm_kev = np.sqrt(electronics.resolution_fwhm_kev**2 / REFERENCE_KEV * energy)
     smeared = np.random.default_rng(int(resolution.integers(2**63)))
@@ -361,12 +356,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         event_number=pulses.event_number,
         peak=pulses.peak,
         t0_ns=np.zeros(n),
-        flag=np.asarray([*FLAGS.values()] @ np.array(flags), np.uint8),
         response=by_height(response, electronics, energy[:, None]).astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
-        tails_kev=tails_kev,
-        n_piled=n_piled,
-        piled_kev=piled_kev,
-        piled_ns=piled_ns - shift_ns,
+        disturbed={"flag": flag, "tails_kev": tails_kev, **disturbed},
     )

@@ -35,8 +35,6 @@ Labels = npt.NDArray[np.int64]
 MARKER = "stand.json"
 _FILES = r"stand\.json|sim\.lh5|data\.lh5|truth\.npz|data_labels\.npz"
 STAND = FolderKind("stand", "cpunet stand", own=_FILES)
-# Truth about each measured trace besides its line, in ``data_labels.npz``.
-OF_DATA = ("flag", "tails_kev", "n_piled", "piled_kev", "piled_ns")
 MADE = {MADE_BY: f"cpunet stand {cpunet.__version__}"}
 LABELS = {"DEP": 0, "SEP": 1, "FEP": 2, "other": 3}
 OTHER = LABELS["other"]
@@ -300,7 +298,7 @@ def _write_data(
             block_seed = np.random.SeedSequence((seed, writer.n_pulses)).generate_state(1)
             traces = read_out(fine, electronics, int(block_seed[0]))
             writer.append(traces)
-            parts.append({"label": label} | {name: getattr(traces, name) for name in OF_DATA})
+            parts.append({"label": label} | traces.disturbed)
     whole: dict[str, Any] = {n: np.concatenate([part[n] for part in parts]) for n in parts[0]}
     saturated = whole["flag"] & FLAGS["saturated"] > 0
     if 2 * saturated.sum() > len(saturated):
