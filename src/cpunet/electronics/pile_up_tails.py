@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.special
 from iminuit import Minuit
 from pydantic import Field
 from scipy.stats import median_abs_deviation
@@ -414,8 +415,6 @@ def characteristic_exponents(u: FloatArray, energies_kev: FloatArray) -> Complex
     >>> characteristic_exponents(np.array([1e-5]), np.array([100.0])).imag.round(6).tolist()
     [[0.001]]
     """
-    import scipy.special  # a fifth of a second, for those who look for tails only
-
     phase = np.maximum(u[:, np.newaxis] * energies_kev, 1e-12)
     sine, cosine = scipy.special.sici(phase)
     return np.asarray(1j * sine - (np.euler_gamma + np.log(phase) - cosine))
@@ -514,15 +513,11 @@ def _likelihood(
     floor = OUTLIERS / max(float(np.ptp(kev)), step)
 
     def likelihood(expected: float, level: float, sigma: float, weights: FloatArray) -> float:
-        # beyond this the noise term is negligible; shorter arrays are also allocated faster
+        # beyond this the noise term is negligible
         u = arguments[: np.searchsorted(arguments, NEGLIGIBLE / sigma)]
-        parts = weights @ exponents[:, : 2 * len(u)]
-        parts *= expected
+        exponent = (expected * (weights @ exponents[:, : 2 * len(u)])).view(np.complex128)
         squares = -0.5 * (sigma * u) ** 2
-        parts[::2] += squares
-        parts[1::2] -= u * (level + first * step)
-        spectrum = parts.view(np.complex128)
-        np.exp(spectrum, out=spectrum)
+        spectrum = np.exp(exponent + squares - 1j * (u * (level + first * step)))
         if wings:
             spectrum *= 1 - wings + wings * np.exp((widths**2 - 1) * squares)
         density = np.maximum(np.fft.irfft(spectrum, points) / step, 0.0)
