@@ -93,9 +93,6 @@ def test_bad_input_is_named(noise) -> None:
             BaselineNoise.of(Baselines.of([raw], CONFIG))
     with pytest.raises(CpunetError, match="pulse 1 has an energy of nan keV"):
         noise.draw(np.array([1.0, np.nan]), 100, np.random.default_rng(0))
-    records = shape(3, 1200).astype(np.float32)
-    with pytest.raises(CpunetError, match="noise is sampled every 16 ns, the pulses every 8"):
-        finish(records, CONFIG, dt_ns=8.0, noise=noise, energy_kev=np.ones(3))
 
 
 GRID, SPECTRUM = 8192, read_electronics("legend200").noise.spectrum
