@@ -64,7 +64,7 @@ def taught(
             print(f"{step:6d} steps, {seconds:5.0f} s: L1 {float(loss.detach()):.4f}")
     settle(ren, side, config)
     kept = KeptNoise(sim.dt_ns)
-    kept.set_noise(noise.noise)
+    kept.set_noise(noise)
     return Run.of(
         {"ren": ren.unet.eval(), "noise": kept},
         recipe,

@@ -7,7 +7,6 @@ import torch
 from torch import nn
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.networks.positional_unet import GruDiscriminator
 from cpunet.recipes.schema import Recipe
 from cpunet.training.adversarial import Game
@@ -50,9 +49,9 @@ def mended(*overrides: str) -> Recipe:
     return load_recipe("paper", [*SMALL, *overrides])
 
 
-def white(rms_kev: float = RMS_KEV) -> TraceNoise:
+def white(rms_kev: float = RMS_KEV) -> BaselineNoise:
     density = np.full(NOISE_BINS, rms_kev**2)
-    return TraceNoise(BaselineNoise(density, NOISE_SAMPLES, 16.0, 100))
+    return BaselineNoise(density, NOISE_SAMPLES, 16.0, 100)
 
 
 def windows(n: int = 12) -> tuple[torch.Tensor, torch.Tensor]:

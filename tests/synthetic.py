@@ -401,4 +401,4 @@ def write_report(
 def mean_kev(law: TailsLaw) -> float:
     """Mean tail, rate times decay time times mean energy (Campbell's theorem)."""
     energies = energies_at((np.arange(1000) + 0.5) / 1000, law.energies_kev)
-    return float(law.expected * energies.mean())
+    return float(law.rate_khz * 1e-3 * law.decay_us * energies.mean())

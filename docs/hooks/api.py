@@ -25,93 +25,20 @@ OPTIONS = (
 )
 # found below the guides where both have a word
 SEARCHED_LAST = "---\nsearch: {boost: 0.2}\n---\n"
+NAMES = """
+train translate validate compare calibrate simulate Simulation make_stand Stand info load
+check response demo tune list_recipes import_weights export_onnx export_legend make_library
+translate_library merge_libraries LegendParameters Adc Run Translation Report Comparison
+Calibration Plan PulseFile HitFile FileOptions HitOptions ReadOptions CpunetError
+open_pulses Pulses REN IREN
+"""
 FRONT = """# Python
 
 What `import cpunet` gives is the stable interface; everything else is sorted by room, in the
 order in which data flow.
-
-::: cpunet.train
-
-::: cpunet.translate
-
-::: cpunet.validate
-
-::: cpunet.compare
-
-::: cpunet.calibrate
-
-::: cpunet.simulate
-
-::: cpunet.Simulation
-
-::: cpunet.make_stand
-
-::: cpunet.Stand
-
-::: cpunet.info
-
-::: cpunet.load
-
-::: cpunet.check
-
-::: cpunet.response
-
-::: cpunet.demo
-
-::: cpunet.tune
-
-::: cpunet.list_recipes
-
-::: cpunet.import_weights
-
-::: cpunet.export_onnx
-
-::: cpunet.export_legend
-
-::: cpunet.make_library
-
-::: cpunet.translate_library
-
-::: cpunet.merge_libraries
-
-::: cpunet.LegendParameters
-
-::: cpunet.Adc
-
-::: cpunet.Run
-
-::: cpunet.Translation
-
-::: cpunet.Report
-
-::: cpunet.Comparison
-
-::: cpunet.Calibration
-
-::: cpunet.Plan
-
-::: cpunet.PulseFile
-
-::: cpunet.HitFile
-
-::: cpunet.FileOptions
-
-::: cpunet.HitOptions
-
-::: cpunet.ReadOptions
-
-::: cpunet.CpunetError
-
-::: cpunet.open_pulses
-
-::: cpunet.Pulses
-
-::: cpunet.REN
-    options:
-      inherited_members: true
-
-::: cpunet.IREN
 """
+FRONT += "".join(f"\n::: cpunet.{name}\n" for name in NAMES.split())
+FRONT = FRONT.replace(".REN\n", ".REN\n    options:\n      inherited_members: true\n")
 
 
 def public_modules(folder: Path) -> list[Path]:

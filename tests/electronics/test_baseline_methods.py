@@ -9,10 +9,17 @@ import scipy.signal
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from cpunet.electronics.baseline_methods import BaselineMethod
+from cpunet.electronics.baseline_methods import (
+    BASELINE_METHODS,
+    LEAD_NS,
+    BaselineMethod,
+    crossing,
+    gauss_exp,
+)
+from cpunet.electronics.chain import Exponentials
 from cpunet.electronics.finishing import finish, record_length
-from cpunet.electronics.superpulses import BASELINE_METHODS, LEAD_NS, crossing, gauss_exp
 from cpunet.errors import CpunetError
+from cpunet.legend.export import kernel_step
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.preparation import prepare
 from synthetic import load_recipe, paired_scores
@@ -23,6 +30,7 @@ DECAY_NS = 54_600.0
 STEPS = 4  # of the fine grid per sample
 FINE_NS = DT_NS / STEPS
 N_FINE = 1200 * STEPS
+TIME_NS = np.arange(N_FINE) * FINE_NS
 NOISE = 4e-4  # of the pulse height, as in a good detector
 
 
@@ -48,22 +56,17 @@ def sampled(fine: FloatArray) -> FloatArray:
     return fine[:, ::STEPS]
 
 
-def decayed(steps: FloatArray, period_ns: float) -> FloatArray:
+def decayed(steps: FloatArray) -> FloatArray:
     """Exponential decay of every bit of charge."""
-    kept = np.exp(-period_ns / DECAY_NS)
+    kept = np.exp(-DT_NS / DECAY_NS)
     return scipy.signal.lfilter([1, -1], [1, -kept], steps, axis=1).astype(np.float32)
 
 
-def convolved(fine: FloatArray, kernel: np.ndarray) -> FloatArray:
+def behind(fine: FloatArray, step: np.ndarray) -> FloatArray:
+    """Samples of pulses behind a circuit, given its response to a step at `TIME_NS`."""
     current = np.diff(fine, axis=1, prepend=0)
-    smooth = scipy.signal.fftconvolve(current, kernel[np.newaxis] / kernel.sum(), axes=1)
-    return np.cumsum(smooth[:, : fine.shape[1]], axis=1).astype(np.float32)
-
-
-def gauss_exp_kernel(sigma_ns: float, tau_ns: float) -> np.ndarray:
-    time = np.arange(0, 1000, FINE_NS)
-    gauss = np.exp(-0.5 * ((time - 6 * sigma_ns) / sigma_ns) ** 2)
-    return np.convolve(gauss, np.exp(-time / tau_ns))
+    response = scipy.signal.fftconvolve(current, step[np.newaxis], axes=1)
+    return sampled(response[:, : fine.shape[1]].astype(np.float32))
 
 
 def simulated(fine: FloatArray) -> FloatArray:
@@ -87,17 +90,33 @@ def other_fine() -> FloatArray:
     return ideal(800, seed=2)
 
 
+def gauss_exp_step(sigma_ns: float, tau_ns: float) -> np.ndarray:
+    return kernel_step(TIME_NS - 6 * sigma_ns, sigma_ns, tau_ns)
+
+
+def rc_late_step(tau_ns: float, late_share: float, late_ns: float) -> np.ndarray:
+    late = Exponentials.low_pass(late_ns, late_share)
+    return (Exponentials.low_pass(tau_ns) * late).step(TIME_NS)
+
+
+RC_LATE = {"tau_ns": (60, 0.1), "late_share": (0.07, 0.2), "late_ns": (500, 0.35)}
+NARROW, WIDE = ({"sigma_ns": (s, 0.03), "tau_ns": (t, 0.03)} for s, t in ((30, 60), (20, 90)))
+
+
 @pytest.mark.parametrize(
-    ("sigma_ns", "tau_ns"), [(30.0, 60.0), pytest.param(20.0, 90.0, marks=pytest.mark.thorough)]
+    ("name", "step", "wanted"),
+    [
+        ("gauss_exp", gauss_exp_step, NARROW),
+        pytest.param("gauss_exp", gauss_exp_step, WIDE, marks=pytest.mark.thorough),
+        ("rc_late", rc_late_step, RC_LATE),
+    ],
 )
-def test_gauss_exp_recovers_its_widths(sim, other_fine, sigma_ns, tau_ns) -> None:
-    response = sampled(convolved(other_fine, gauss_exp_kernel(sigma_ns, tau_ns)))
-    method = BASELINE_METHODS["gauss_exp"](
-        sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN
-    )
-    assert method.values["sigma_ns"] == pytest.approx(sigma_ns, rel=0.03)
-    assert method.values["tau_ns"] == pytest.approx(tau_ns, rel=0.03)
-    assert method.tail_slope_per_ms == pytest.approx(-1e6 / DECAY_NS, rel=0.01)
+def test_kernels_are_recovered(sim, other_fine, name, step, wanted) -> None:
+    response = behind(other_fine, step(*(value for value, _ in wanted.values())))
+    found = BASELINE_METHODS[name](sim, measured(decayed(response)), DT_NS, ALIGN).values
+    for value, (true, error) in wanted.items():
+        assert found[value] == pytest.approx(true, rel=error)
+    assert found["tail_slope_per_ms"] == pytest.approx(-1e6 / DECAY_NS, rel=0.01)
 
 
 @pytest.mark.parametrize("tau_ns", [DT_NS, 50.0, 100.0])
@@ -105,26 +124,20 @@ def test_rc_recovers_its_time_constant(sim, other_fine, tau_ns) -> None:
     """From a period on, behind which pulses are fast enough."""
     rate = DT_NS / tau_ns
     response = scipy.signal.lfilter([0, rate], [1, rate - 1], sampled(other_fine), axis=1)
-    method = BASELINE_METHODS["rc"](sim, measured(decayed(response, DT_NS)), DT_NS, ALIGN)
+    method = BASELINE_METHODS["rc"](sim, measured(decayed(response)), DT_NS, ALIGN)
     assert method.values["tau_ns"] == pytest.approx(tau_ns, rel=0.05)
 
 
-def two_pole_kernel() -> np.ndarray:
-    """A kernel that none of the parametric methods can take on: fast, and a slow part."""
-    time = np.arange(0, 2000, FINE_NS)
-    return 0.93 * time / 40**2 * np.exp(-time / 40) + 0.07 / 300 * np.exp(-time / 300)
-
-
 def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
-    kernel = two_pole_kernel()
-    data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
+    """One that no method with parameters can take on: fast, and a slow part."""
+    fast = Exponentials.low_pass(40.0) * Exponentials.low_pass(40.1)
+    circuit = fast * Exponentials.low_pass(300.0, 0.07)
+    data = measured(decayed(behind(other_fine, circuit.step(TIME_NS))))
     method = BASELINE_METHODS["superpulse"](sim, data, DT_NS, ALIGN)
     lead, length = round(LEAD_NS / DT_NS), record_length(CONFIG.length, DT_NS)
     steps = np.cumsum(np.roll(scipy.fft.irfft(method.transfer, length), lead))[np.newaxis]
-    time = np.arange(0, 200) * DT_NS
-    true = np.interp(time, np.arange(len(kernel)) * FINE_NS, np.cumsum(kernel) / kernel.sum())
-    at = crossing(steps, 0.5)[0]
-    true_at = crossing(true[np.newaxis], 0.5)[0]
+    true = circuit.step(np.arange(200) * DT_NS)
+    at, true_at = crossing(steps, 0.5)[0], crossing(true[np.newaxis], 0.5)[0]
     shifted = np.interp(np.arange(60) - at + true_at, np.arange(200), true, left=0.0)
     # the step of the free kernel keeps the band that the pulses have
     np.testing.assert_allclose(steps[0, :60], shifted, atol=0.06)
@@ -136,10 +149,11 @@ def test_superpulse_reproduces_a_kernel(sim, other_fine) -> None:
 def test_windows_are_those_of_the_true_response(sigma_ns: float, tau_ns: float) -> None:
     """Response of a window, extended, and window of the response are the same."""
     fine = ideal(20, seed=3)
-    true = sampled(convolved(fine, gauss_exp_kernel(sigma_ns, tau_ns)))
-    truth = finish(decayed(true, DT_NS), CONFIG, dt_ns=DT_NS).windows
+    true = behind(fine, gauss_exp_step(sigma_ns, tau_ns))
+    truth = finish(decayed(true), CONFIG, dt_ns=DT_NS).windows
     s = 2j * np.pi * scipy.fft.rfftfreq(record_length(CONFIG.length, DT_NS), DT_NS)
-    method = BaselineMethod(DT_NS, -1e6 / DECAY_NS, gauss_exp(s, sigma_ns, tau_ns), {})
+    decay = {"tail_slope_per_ms": -1e6 / DECAY_NS}
+    method = BaselineMethod(DT_NS, gauss_exp(s, sigma_ns, tau_ns), decay)
     windows = finish(method.translate(simulated(fine)), CONFIG, dt_ns=DT_NS).windows
     scores = paired_scores(windows, truth, 100)
     # What a response computed at 16 ns instead of on the fine grid costs: up to 5.0e-4
@@ -154,15 +168,3 @@ def test_bad_input_is_named(sim) -> None:
             method(sim[:7], sim, DT_NS, ALIGN)
     with pytest.raises(CpunetError, match="check their polarity"):
         BASELINE_METHODS["rc"](sim, -sim, DT_NS, ALIGN)
-
-
-def test_rc_with_late_charge_recovers_its_parts(sim, other_fine) -> None:
-    time = np.arange(0, 6000, FINE_NS)
-    kernel = np.convolve(
-        np.exp(-time / 60) / 60, 0.93 * (time == 0) / FINE_NS + 0.07 * np.exp(-time / 500) / 500
-    )[: len(time)]
-    data = measured(decayed(sampled(convolved(other_fine, kernel)), DT_NS))
-    found = BASELINE_METHODS["rc_late"](sim, data, DT_NS, ALIGN)
-    assert found.values["tau_ns"] == pytest.approx(60, rel=0.1)
-    assert found.values["late_share"] == pytest.approx(0.07, abs=0.015)
-    assert found.values["late_ns"] == pytest.approx(500, rel=0.35)

@@ -93,9 +93,6 @@ def test_bad_input_is_named(noise) -> None:
             BaselineNoise.of(Baselines.of([raw], CONFIG))
     with pytest.raises(CpunetError, match="pulse 1 has an energy of nan keV"):
         noise.draw(np.array([1.0, np.nan]), 100, np.random.default_rng(0))
-    records = shape(3, 1200).astype(np.float32)
-    with pytest.raises(CpunetError, match="noise is sampled every 16 ns, the pulses every 8"):
-        finish(records, CONFIG, dt_ns=8.0, noise=noise, energy_kev=np.ones(3))
 
 
 GRID, SPECTRUM = 8192, read_electronics("legend200").noise.spectrum
@@ -127,18 +124,6 @@ def test_noise_slower_than_a_baseline_is_found() -> None:
     assert found == pytest.approx(4 * power[slow].sum(), rel=0.5)
 
 
-@pytest.mark.parametrize("samples", [3000, 6000, 8192])
-def test_a_line_does_not_beat_in_long_records(samples: int) -> None:
-    lines = np.zeros((1, 4097))
-    lines[0, 901] = 100.0
-    quiet = np.zeros((1, 4097))
-    noise = BaselineNoise(lines[0], 8192, DT_NS, 100, quiet, lines, np.ones(1))
-    drawn = noise.draw(np.ones(40), samples, np.random.default_rng(3))
-    rms = drawn.std(axis=1)
-    assert np.ptp(rms) < 0.01 * rms.mean()
-    assert rms.mean() == pytest.approx(np.sqrt(2 * 100.0 / 8192), rel=0.01)
-
-
 def test_a_line_is_a_sine_of_its_height() -> None:
     rng = np.random.default_rng(9)
     phase = rng.uniform(0, 2 * np.pi, (800, 1))
@@ -152,6 +137,9 @@ def test_a_line_is_a_sine_of_its_height() -> None:
     assert np.median(heights) == pytest.approx(3, rel=0.07)
     # Gaussian noise in a narrow band is twice as often low as high
     assert heights.std() < 0.15 * heights.mean()
+    for samples in (3000, 6000, 8192):  # a line of two bins would beat
+        rms = noise.draw(np.ones(40), samples, np.random.default_rng(3)).std(axis=1)
+        assert np.ptp(rms) < 0.1 * rms.mean()
 
 
 def test_baselines_of_different_kinds_are_drawn_as_such() -> None:
@@ -185,11 +173,15 @@ def test_noise_has_the_power_of_baselines_of_which_some_are_quiet() -> None:
     assert ratios == pytest.approx(1, abs=0.02)
 
 
-def test_constant_baselines_are_left_out() -> None:
+def test_what_has_no_noise_or_no_energy_is_left_out() -> None:
     baselines = np.random.default_rng(5).normal(size=(1000, 1200))
     baselines[::20] = 0
-    noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
-    assert noise.n_baselines <= 950
+    baselines[1::20] *= 500
+    raw = on_baselines(baselines)
+    raw.energy_kev[1::20] = np.nan
+    raw.energy_kev[2::20] = 0
+    noise = noise_of(as_input(raw))
+    assert noise.n_baselines <= 850
     assert noise.rms / TO_PREPARED == pytest.approx(1, abs=0.02)
     with pytest.raises(CpunetError, match="most baselines are constant"):
         BaselineNoise.of(Baselines.of([on_baselines(0 * baselines[:100])], CONFIG))
@@ -203,16 +195,6 @@ def as_input(raw: Pulses) -> InputSet:
     prepared, baselines = prepare(raw, FAST, "measured"), Baselines.of([raw], FAST)
     recipe = load_recipe("fast")
     return InputSet(prepared, DT_NS, Path("raw"), raw.energy_kev, recipe, baselines=baselines)
-
-
-def test_energies_that_are_not_known_do_not_matter() -> None:
-    raw = traces(400)
-    raw.energy_kev[::4] = np.nan
-    raw.energy_kev[1::4] = 0
-    raw.waveforms[::4] += np.random.default_rng(1).normal(0, 500, raw.waveforms[::4].shape)
-    noise = noise_of(as_input(raw))
-    assert noise.rms == pytest.approx(WANTED, rel=0.04)
-    assert noise.n_baselines <= 200
 
 
 @pytest.mark.parametrize("start", [560, 300, 240])

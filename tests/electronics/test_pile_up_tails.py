@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
 
 from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import read_electronics
-from cpunet.electronics.drawn_pile_up import (
-    SIZES_KEV,
-    DrawnTails,
-    TailsLaw,
-    TraceNoise,
-    energies_at,
-)
+from cpunet.electronics.drawn_pile_up import SIZES_KEV, DrawnTails, TailsLaw, energies_at
 from cpunet.electronics.measured import passing
 from cpunet.electronics.pile_up_tails import PileUpTails, characteristic_exponents, fit_rate
 from cpunet.electronics.readout import RawTraces, read_out
@@ -35,7 +29,8 @@ def test_drawn_tails_have_the_characteristic_function_of_the_law(rate_khz: float
     assert drawn.mean() == pytest.approx(mean_kev(law), rel=0.1)
     u = np.geomspace(1e-3, 0.5, 10)
     energies = energies_at((np.arange(1000) + 0.5) / 1000, TH228)
-    wanted = np.exp(law.expected * characteristic_exponents(u, energies).mean(axis=1))
+    expected = rate_khz * 1e-3 * 54.6
+    wanted = np.exp(expected * characteristic_exponents(u, energies).mean(axis=1))
     found = np.exp(1j * u[:, np.newaxis] * drawn).mean(axis=1)
     np.testing.assert_allclose(found, wanted, atol=0.01)  # three errors of either part
 
@@ -46,15 +41,8 @@ def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
     energies = energies_at(rng.random(4000), TH228)
     measured = law.draw(4000, rng) + rng.normal(0, error_kev, 4000)
     found = fit_rate(measured, error_kev, 54.6, energies)
-    assert found.recorded
     assert found.law.rate_khz == pytest.approx(1.5, abs=3 * found.rate_error_khz)
     assert found.sigma_kev == pytest.approx(error_kev, rel=0.05)
-
-
-def test_too_many_earlier_pulses_are_refused_before_they_fill_the_memory():
-    endless = TailsLaw(0.02, 1e12, TH228)
-    with pytest.raises(CpunetError, match="give a lower rate, or a shorter decay or record"):
-        endless.draw(1000, np.random.default_rng(1))
 
 
 RECIPE = load_recipe("fast")
@@ -89,22 +77,21 @@ def found(busy: RawTraces) -> PileUpTails:
 
 def test_each_trace_has_its_tail(busy: RawTraces, found: PileUpTails):
     np.testing.assert_allclose(found.measure(as_pulses(busy)), found.kev, atol=1e-9)
-    alone = np.isfinite(found.kev) & (busy.n_piled == 0)
-    off = (found.kev - busy.tails_kev)[alone & (busy.tails_kev < 50)]
+    tails_kev = busy.disturbed["tails_kev"]
+    alone = np.isfinite(found.kev) & (busy.disturbed["n_piled"] == 0)
+    off = (found.kev - tails_kev)[alone & (tails_kev < 50)]
     assert abs(np.median(off)) < 0.3
     assert 1.4826 * np.median(np.abs(off)) == pytest.approx(found.fit.sigma_kev, rel=0.1)
-    large = alone & (busy.tails_kev > 100)
+    large = alone & (tails_kev > 100)
     # heights of pulses, not their charge, are the scale: 1.5 % less of `ornl`
-    assert np.median(found.kev[large] / busy.tails_kev[large]) == pytest.approx(1, abs=0.02)
+    assert np.median(found.kev[large] / tails_kev[large]) == pytest.approx(1, abs=0.02)
     assert alone.mean() > 0.9
 
 
 def test_rate_and_decay_are_found_without_the_energies(found: PileUpTails):
     assert found.level_weight
-    assert found.decay_error_us is not None
     # tails within the window are 25 % steeper, by the decay of 2.9 us
     assert found.decay_us == pytest.approx(54.6, rel=0.01)
-    assert not found.fit.recorded  # the file has lines alone
     assert found.law is not None
     assert found.law.rate_khz == pytest.approx(1, abs=3 * found.fit.rate_error_khz)
     assert found.fit.rate_error_khz < 0.12
@@ -112,11 +99,21 @@ def test_rate_and_decay_are_found_without_the_energies(found: PileUpTails):
 
 
 @pytest.mark.thorough
-@pytest.mark.parametrize("preset", ["ornl", "legend200"])
-def test_nothing_is_invented_where_there_is_nothing(preset: str):
-    found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.0, preset))], PREPARATION))
-    assert found.law is None
-    assert found.describe().rate_khz == 0
+def test_rates_of_slow_decays_and_none_and_too_many():
+    def measured(rate_khz: float, preset: str = "legend200", n: int = 2000) -> PileUpTails:
+        raw = as_pulses(traces_of(rate_khz, preset, n))
+        return PileUpTails.of(Baselines.of([raw], PREPARATION))
+
+    for preset in ("ornl", "legend200"):
+        none = measured(0.0, preset)
+        assert none.law is None
+        assert none.describe().rate_khz == 0
+    slow = measured(0.3)  # by their levels
+    assert slow.law is not None
+    assert slow.law.rate_khz == pytest.approx(0.3, abs=3 * slow.fit.rate_error_khz)
+    assert slow.decay_us == pytest.approx(570, rel=0.05)
+    with pytest.raises(CpunetError, match="nearly all traces lie on pile-up tails"):
+        measured(3.0, n=3000)
 
 
 def test_levels_that_tell_nothing_are_left_out():
@@ -129,30 +126,16 @@ def test_levels_that_tell_nothing_are_left_out():
     found = PileUpTails.of(Baselines.of(blocks, PREPARATION))
     assert not found.level_weight
     assert found.describe().told_by == "slope"
-    large = np.isfinite(found.kev) & (busy.n_piled == 0) & (busy.tails_kev > 100)
-    ratio = np.median(found.kev[large] / busy.tails_kev[large])
-    assert ratio == pytest.approx(1, abs=0.1)
+    tails_kev, sigma_kev = busy.disturbed["tails_kev"], found.fit.sigma_kev
+    known = np.isfinite(found.kev)
+    large = known & (busy.disturbed["n_piled"] == 0) & (tails_kev > 100)
+    assert np.median(found.kev[large] / tails_kev[large]) == pytest.approx(1, abs=0.1)
     # noise is measured where slopes are negative: it has all its power, and few tails
     empty = found.empty(blocks[0])
-    assert (busy.tails_kev[empty] > found.fit.sigma_kev).mean() < 0.05
-    told = np.isfinite(found.kev) & (busy.tails_kev < 0.2 * found.fit.sigma_kev)
-    square, alone = found.kev[told & empty] ** 2, found.kev[told] ** 2
+    assert (tails_kev[empty] > sigma_kev).mean() < 0.05
+    little = known & (tails_kev < 0.2 * sigma_kev)
+    square, alone = found.kev[little & empty] ** 2, found.kev[little] ** 2
     assert square.mean() == pytest.approx(alone.mean(), rel=0.15)
-
-
-@pytest.mark.thorough
-def test_traces_that_all_lie_on_tails_are_told():
-    traces = as_pulses(traces_of(3.0, "legend200", n=3000))
-    with pytest.raises(CpunetError, match="nearly all traces lie on pile-up tails"):
-        PileUpTails.of(Baselines.of([traces], PREPARATION))
-
-
-@pytest.mark.thorough
-def test_slow_decays_are_told_by_their_levels():
-    found = PileUpTails.of(Baselines.of([as_pulses(traces_of(0.3, "legend200"))], PREPARATION))
-    assert found.law is not None
-    assert found.law.rate_khz == pytest.approx(0.3, abs=3 * found.fit.rate_error_khz)
-    assert found.decay_us == pytest.approx(570, rel=0.05)
 
 
 @pytest.mark.parametrize(
@@ -167,6 +150,11 @@ def test_slow_decays_are_told_by_their_levels():
 def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: str):
     with pytest.raises(CpunetError, match=said):
         PileUpTails.of(Baselines.of([change(as_pulses(busy)[:400])], PREPARATION))
+
+
+def test_more_pulses_than_memory_holds_are_refused():
+    with pytest.raises(CpunetError, match="give a lower rate, or a shorter decay or record"):
+        TailsLaw(0.02, 1e12, TH228).draw(1000, np.random.default_rng(1))
 
 
 LAW = TailsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)
@@ -189,8 +177,8 @@ def test_records_get_noise_and_tails_in_proportion_to_their_energies():
     noise = BaselineNoise(np.full(513, 1e-8), 1024, 16.0, 50)
     energies = np.repeat([500.0, 2000.0], 4000)
     rng = np.random.default_rng(3)
-    records = TraceNoise(noise, DRAWN).draw(energies, 600, rng)
-    assert TraceNoise(noise).draw(energies, 600, rng).std() < 1e-3
+    records = replace(noise, tails=DRAWN).draw(energies, 600, rng)
+    assert noise.draw(energies, 600, rng).std() < 1e-3
     first = records[:, 0] * energies / DRAWN.height
     for part in (first[:4000], first[4000:]):
         assert (part > 5).mean() == pytest.approx(
@@ -214,7 +202,7 @@ def test_what_passes_is_measured_by_adding_tails_to_traces_without():
     assert passed[0] == 1
     assert passed[-1] == 0
     drawn = DrawnTails(**asdict(found.fit.law), height=0.9, lead_us=0, dt_ns=16, passed=passed)
-    kev, true = drawn.draw_kev(20_000, rng), traces.tails_kev[kept.index]
+    kev, true = drawn.draw_kev(20_000, rng), traces.disturbed["tails_kev"][kept.index]
     for size in (3, 10, 20):
         assert (kev > size).mean() == pytest.approx((true > size).mean(), abs=0.02)
     assert passing(found, raw[:5], PREPARATION, cuts) is None

@@ -23,7 +23,6 @@ from cpunet.electronics.finishing import record_length, with_room
 from cpunet.electronics.readout import (
     by_height,
     coloured_noise,
-    draw_other_pulses,
     linear_response,
     noise_power,
     read_out,
@@ -159,21 +158,22 @@ def test_noise_has_the_spectrum_asked_for(dt_ns: float):
     assert np.abs(ratio - 1).max() < 0.05
 
 
-def test_clean_traces_are_baseline_gain_and_response():
-    rng, quiet = np.random.default_rng(1), altered(noise=QUIET, **rates())
-    ramps = np.clip(np.arange(900) / rng.uniform(40, 120, (300, 1)), 0, 1)
-    pulses = Pulses.of(ramps, dt_ns=4, energy_kev=rng.uniform(500, 2614.5, 300))
-    traces = read_out(pulses, quiet, seed=3)
-    height = quiet.gain_adc_per_kev * traces.true_energy_kev[:, None]
-    expected = traces.baseline_adc[:, None] + height * traces.response
-    assert np.abs(traces.waveforms - expected).max() <= 0.51
-    assert not traces.flag.any()
-
-
 def test_tails_follow_the_law_and_all_decays_of_the_chain():
-    chain = altered("ornl", record_ns=19_200, **rates(3))
-    steps = Pulses.of(np.ones((4000, 10)), dt_ns=4, energy_kev=np.full(4000, 1000.0))
-    added_kev, tails_kev, _ = draw_other_pulses(steps, chain, np.random.default_rng(1))
+    """Behind baseline, gain and response, of pulses of any energy, nothing else is left."""
+    rng, chain = (
+        np.random.default_rng(1),
+        altered("ornl", record_ns=19_200, noise=QUIET, **rates(3)),
+    )
+    ramps = np.clip(np.arange(900) / rng.uniform(40, 120, (4000, 1)), 0, 1)
+    traces = read_out(
+        Pulses.of(ramps, dt_ns=4, energy_kev=rng.uniform(500, 1500, 4000)), chain, 3
+    )
+    own = traces.true_energy_kev[:, None] * traces.response
+    added_kev = (traces.waveforms - traces.baseline_adc[:, None]) / chain.gain_adc_per_kev - own
+    tails_kev = traces.disturbed["tails_kev"]
+    without = tails_kev == 0
+    assert np.abs(added_kev[without]).max() <= 0.51 / chain.gain_adc_per_kev
+    assert not traces.disturbed["flag"][without].any()
     law = TailsLaw(3, 54.6, chain.other_pulses_kev)
     above = [5, 20, 100, 500]
     found = [(tails_kev > kev).mean() for kev in above]
@@ -190,7 +190,8 @@ def test_piled_up_pulses_are_where_the_truth_says():
     chain = altered("ornl", noise=QUIET, trigger_jitter_ns=200, **rates(0, 30))
     steps = Pulses.of(np.ones((200, 900)), dt_ns=4, energy_kev=np.full(200, 1000.0))
     traces = read_out(steps, chain, seed=2)
-    alone = np.flatnonzero((traces.n_piled == 1) & (traces.piled_ns > 1000))
+    n_piled, kev, after_ns = (traces.disturbed[n] for n in ("n_piled", "piled_kev", "piled_ns"))
+    alone = np.flatnonzero((n_piled == 1) & (after_ns > 1000))
     assert len(alone) > 10
     adc = chain.gain_adc_per_kev
     own = adc * traces.true_energy_kev[:, None] * traces.response
@@ -203,9 +204,9 @@ def test_piled_up_pulses_are_where_the_truth_says():
         low, high = (rows[np.arange(len(rows)), at] for at in (after - 1, after))
         return chain.dt_ns * (after - (high - level) / (high - low))
 
-    assert rise_ns(rest) - rise_ns(own[alone]) == pytest.approx(traces.piled_ns[alone], abs=5)
-    assert rest.max(axis=1) == pytest.approx(traces.piled_kev[alone], rel=0.03)
-    assert np.isnan(traces.piled_kev[traces.n_piled == 0]).all()
+    assert rise_ns(rest) - rise_ns(own[alone]) == pytest.approx(after_ns[alone], abs=5)
+    assert rest.max(axis=1) == pytest.approx(kev[alone], rel=0.03)
+    assert np.isnan(kev[n_piled == 0]).all()
 
 
 def test_what_acts_by_height_follows_its_definition():
@@ -227,7 +228,7 @@ def test_energies_have_the_resolution_and_high_ones_are_clipped():
     short = altered(record_ns=640, before_ns=160, gain_adc_per_kev=40, **rates())
     traces = read_out(lines, short, seed=1)
     assert 2.355 * traces.energy_kev[4000:].std() == pytest.approx(2.6, rel=0.05)
-    assert ((traces.flag & 4 > 0) == (energy > 1000)).all()
+    assert ((traces.disturbed["flag"] & 4 > 0) == (energy > 1000)).all()
     assert (traces.waveforms.max(axis=1) == 65535)[4000:].all()
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -93,11 +92,9 @@ def test_the_folder_is_read_and_prepared(tmp_path: Path) -> None:
     measured = data.prepared.pulses.waveforms.mean(axis=0)
     assert np.abs(truth.mean(axis=0) - measured).max() < 0.1
     made_by = json.loads((made / "stand.json").read_text())
-    assert made_by["shift"]["temperature_K"] == 2
     assert made_by["data"]["detector"]["temperature_K"] == 92
-    with np.load(made / "data_labels.npz") as stored:
-        flags = dict(stored)
-    assert len(flags["label"]) == len(flags["flag"]) == made_by["counts"]["n_data"]
+    flags = np.load(made / "data_labels.npz")
+    assert len(flags["label"]) == made_by["counts"]["n_data"]
     assert set(flags["label"]) <= {0, 2, 3}
     left = flags["tails_kev"] > 1
     assert (left == (flags["flag"] & 1 > 0)).mean() > 0.99
@@ -146,6 +143,22 @@ def test_pulses_made_again_are_those_stored(tmp_path: Path, preset: str) -> None
     # the record ends with whole samples of either period
     kept = values.shape[1] - 1
     np.testing.assert_allclose(again.waveforms[:, :kept], values[:, :kept], atol=1e-6)
+    # a file that cannot be made again says why
+    damages: dict[str, Callable[[Any], Any]] = {
+        "give an output of cpunet": lambda file: file["geds/sim"].attrs.pop("simulation"),
+        "give an output of cpunet simulate or": lambda file: file.pop("geds/hits"),
+        "other ev": lambda file: file["geds/sim/event_number"].write_direct(
+            again.event_number * 0
+        ),
+        "cannot be used by": lambda file: file["geds/sim"].attrs.update(simulation="{}"),
+        "cannot be used by this": lambda file: file["geds/sim"].attrs.update(simulation="{"),
+    }
+    for said, damage in damages.items():
+        path = shutil.copy(tmp_path / "a" / "sim.lh5", tmp_path / "damaged.lh5")
+        with h5py.File(path, "r+") as file:
+            damage(file)
+        with pytest.raises(CpunetError, match=said):
+            StoredSimulation.read(path)
 
 
 def test_any_shift_is_that_of_the_data(tmp_path: Path) -> None:
@@ -180,20 +193,3 @@ def test_what_a_stand_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(CpunetError, match="`events` FEP=0: give at least 1 event"):
         make_stand(tmp_path / "a", events="FEP=0")
     assert list(tmp_path.iterdir()) == []
-
-
-def test_a_file_that_cannot_be_made_again_says_why(tmp_path: Path) -> None:
-    make_stand(tmp_path / "a", **(SMALL | {"events": "FEP=3"}))
-    damages: dict[str, Callable[[Any], Any]] = {
-        "give an output of cpunet": lambda file: file["geds/sim"].attrs.pop("simulation"),
-        "give an output of cpunet simulate or": lambda file: file.pop("geds/hits"),
-        "other ev": lambda file: file["geds/sim/event_number"].write_direct(np.ones(3, int)),
-        "cannot be used by": lambda file: file["geds/sim"].attrs.update(simulation="{}"),
-        "cannot be used by this": lambda file: file["geds/sim"].attrs.update(simulation="{"),
-    }
-    for said, damage in damages.items():
-        path = shutil.copy(tmp_path / "a" / "sim.lh5", tmp_path / "damaged.lh5")
-        with h5py.File(path, "r+") as file:
-            damage(file)
-        with pytest.raises(CpunetError, match=re.escape(said)):
-            StoredSimulation.read(path)

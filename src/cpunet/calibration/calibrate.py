@@ -263,7 +263,7 @@ def _search(
     pulses = some.pulses, data.prepared.pulses
     search = Search(
         simulator=Simulator(stored.hits[some.index], physics),
-        sets=PulseSets(*pulses, noise.noise, recipe, rng, noise.tails),
+        sets=PulseSets(*pulses, noise, recipe, rng),
         chosen=chosen,
     )
     return search, data

@@ -19,6 +19,7 @@ import scipy.ndimage
 import scipy.optimize
 
 from cpunet.electronics.chain import FloatArray as Values
+from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import SHORTEST_SHARE, Baselines
 from cpunet.pulses.container import FloatArray, blocks, line_slope
@@ -73,6 +74,8 @@ class BaselineNoise:
     rms_error
         Standard error of `rms`. It includes the spread of the baselines and all noise that is
         extrapolated to periods longer than a baseline. None if not estimated from baselines.
+    tails
+        Pile-up tails that are drawn together with the noise, or None for noise alone.
 
     Examples
     --------
@@ -94,6 +97,7 @@ class BaselineNoise:
     lines: Values | None = None
     shares: Values | None = None
     rms_error: float | None = None
+    tails: DrawnTails | None = None
 
     @classmethod
     def of(cls, baselines: Baselines, chosen: npt.NDArray[np.bool_] | None = None) -> Self:
@@ -173,7 +177,7 @@ class BaselineNoise:
         return float(np.sqrt(both / self.samples))
 
     def draw(self, energy_kev: Values, length: int, rng: np.random.Generator) -> FloatArray:
-        """Draw Gaussian noise for pulses of given energies.
+        """Draw Gaussian noise, and pile-up tails if any, for pulses of given energies.
 
         Each long trace of one kind is cut into parts for several pulses, assigned in random
         order and with random signs. Noise slower than a record is nearly the same in these
@@ -231,6 +235,9 @@ class BaselineNoise:
             traces = scipy.fft.irfft(bins, long, axis=1, overwrite_x=True)
             noise[rows] = traces[:, : each * length].reshape(-1, length)[: len(rows)]
         noise *= (rng.choice((-1.0, 1.0), n) / energy_kev)[:, np.newaxis]
+        if self.tails is not None:
+            factors = self.tails.factors(energy_kev, rng)
+            noise += factors[:, np.newaxis] * self.tails.decay(length).astype(np.float32)
         return noise
 
     def density_of(self, length: int) -> Values:
@@ -268,8 +275,8 @@ def require_energies(energy_kev: Values, events: npt.NDArray[np.integer] | None 
 def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     """Cluster baselines into kinds; all are of kind 0 if they differ only statistically.
 
-    The features are the logarithms of the power in bands, along directions in which their
-    spread exceeds that of baselines drawn from the mean spectrum.
+    The features are the logarithms of the power in bands of equal width, along directions in
+    which their spread exceeds that of baselines drawn from the mean spectrum.
     """
     import scipy.cluster.vq  # loads half of SciPy: only for those who need kinds
 
@@ -277,8 +284,13 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     if kinds < 2 or flat.shape[1] // 2 + 1 < FIRST_OF_BANDS + BANDS:
         return alike
     rng = np.random.default_rng(0)
-    own = _band_powers(flat)
-    chance = _band_powers(mean.draw(np.ones(len(flat)), flat.shape[1], rng).astype(float))
+    powers, window = list[Values](), np.hanning(flat.shape[1])
+    for baselines in (flat, mean.draw(np.ones(len(flat)), flat.shape[1], rng).astype(float)):
+        centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
+        power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
+        bands = np.array_split(power[:, FIRST_OF_BANDS:], BANDS, axis=1)
+        powers.append(np.log(np.stack([band.mean(axis=1) for band in bands], axis=1)))
+    own, chance = powers
     scale = chance.std(axis=0)
     own, chance = (own - own.mean(axis=0)) / scale, (chance - chance.mean(axis=0)) / scale
     _, _, axes = np.linalg.svd(np.clip(own, -OUTLIER, OUTLIER), full_matrices=False)
@@ -293,15 +305,6 @@ def _kinds(flat: Values, mean: BaselineNoise) -> npt.NDArray[np.intp]:
     # at least has as many
     enough = np.bincount(which, minlength=kinds) >= MIN_BASELINES
     return np.asarray(scipy.cluster.vq.vq(points, centres[enough])[0], np.intp)
-
-
-def _band_powers(baselines: Values) -> Values:
-    """Logarithm of the power in bands of equal width, shape ``(n, bands)``."""
-    window = np.hanning(baselines.shape[1])
-    centred = (baselines - baselines.mean(axis=1, keepdims=True)) * window
-    power = np.abs(scipy.fft.rfft(centred, axis=1)) ** 2
-    bands = np.array_split(power[:, FIRST_OF_BANDS:], BANDS, axis=1)
-    return np.asarray(np.log(np.stack([b.mean(axis=1) for b in bands], axis=1)), float)
 
 
 def spectrum(baselines: Values, samples: int) -> tuple[Values, Values]:

@@ -69,10 +69,8 @@ class Exponentials:
         cls, final: float, fractions: Sequence[float], taus_ns: Sequence[float]
     ) -> Exponentials:
         r"""Circuit with a step response of :math:`r_\infty + \sum_i f_i e^{-t/\tau_i}`."""
-        poles = -1 / np.array(taus_ns, float)
-        residues = -np.array(fractions, float) / np.array(taus_ns, float)
-        both = (np.asarray(values, np.complex128) for values in (poles, residues))
-        return cls(final + sum(fractions), *both)
+        taus = np.array(taus_ns, np.complex128)
+        return cls(final + sum(fractions), -1 / taus, -np.array(fractions) / taus)
 
     @classmethod
     def low_pass(cls, tau_ns: float, fraction: float = 1.0) -> Exponentials:
@@ -268,8 +266,8 @@ class Electronics(Config):
 
     @model_validator(mode="after")
     def _is_possible(self) -> Electronics:
-        total, lines = sum(part.fraction for part in self.decays), self.noise.spectrum.lines
-        nyquist_MHz, fault = 500 / self.dt_ns, ""
+        total, fault = sum(part.fraction for part in self.decays), ""
+        nyquist_MHz, lines = 500 / self.dt_ns, self.noise.spectrum.lines
         if abs(total - 1) > 1e-6:
             fault = f"decays: their fractions add up to {total:g}; they must to 1"
         elif list(self.other_pulses_kev) != sorted(self.other_pulses_kev):

@@ -26,7 +26,6 @@ from typing import Any, Self
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.chain import FloatArray as Values
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray
@@ -35,7 +34,6 @@ from cpunet.pulses.container import FloatArray
 LIFETIMES = 12.0
 # Maximum expected numbers of pulses before a trace, for memory, and within one.
 MAX_EXPECTED, MAX_PILED = 10_000.0, 4.0
-_MIN_KEV = 1e-3
 _ENERGIES = 64  # energies that represent a spectrum in sums over it
 # Tails in keV at which the probability of passing the cuts is measured.
 SIZES_KEV = (0.0, *np.geomspace(3.0, 3000.0, 25).tolist())
@@ -68,11 +66,6 @@ class TailsLaw:
     decay_us: float
     energies_kev: tuple[float, ...]
 
-    @property
-    def expected(self) -> float:
-        r"""Expected number of pulses per decay time, :math:`R \tau`."""
-        return self.rate_khz * 1e-3 * self.decay_us
-
     def share_above(self, kev: npt.ArrayLike) -> Values:
         r"""Fraction of traces on which a single earlier pulse leaves more than `kev`.
 
@@ -90,7 +83,8 @@ class TailsLaw:
         energies = energies_at((np.arange(_ENERGIES) + 0.5) / _ENERGIES, self.energies_kev)
         ratio = energies / np.asarray(kev, float)[..., np.newaxis]
         lives = np.log(np.maximum(ratio, 1)).mean(axis=-1)
-        return np.asarray(-np.expm1(-self.expected * lives), float)
+        expected = self.rate_khz * 1e-3 * self.decay_us
+        return np.asarray(-np.expm1(-expected * lives), float)
 
     def draw(self, n: int, rng: np.random.Generator) -> Values:
         """Draw the tail in keV, summed over all earlier pulses, for `n` traces."""
@@ -159,9 +153,8 @@ def energies_at(share: Values, energies_kev: Sequence[float]) -> Values:
 
     The spectrum is given by its quantiles, see `TailsLaw`.
     """
-    logs = np.log(np.maximum(np.asarray(energies_kev, float), _MIN_KEV))
-    at = np.linspace(0, 1, len(logs))
-    return np.asarray(np.exp(np.interp(share, at, logs)), float)
+    at = np.linspace(0, 1, len(energies_kev))
+    return np.asarray(np.exp(np.interp(share, at, np.log(energies_kev))), float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,35 +201,6 @@ class DrawnTails(TailsLaw):
         """Draw tails for pulses of given energies, in prepared units."""
         kev = self.draw_kev(len(energy_kev), rng)
         return np.asarray(kev * self.height / energy_kev, np.float32)
-
-
-@dataclass(frozen=True, eq=False)
-class TraceNoise:
-    """Noise and pile-up tails: everything that is added to a record.
-
-    Parameters
-    ----------
-    noise
-        Noise of the baselines.
-    tails
-        Pile-up tails, or None for noise alone.
-    """
-
-    noise: BaselineNoise
-    tails: DrawnTails | None = None
-
-    @property
-    def dt_ns(self) -> float:
-        """Sampling period of the noise in ns."""
-        return self.noise.dt_ns
-
-    def draw(self, energy_kev: Values, length: int, rng: np.random.Generator) -> FloatArray:
-        """Draw noise as `BaselineNoise.draw`, with pile-up tails added."""
-        drawn = self.noise.draw(energy_kev, length, rng)
-        if self.tails is not None:
-            factors = self.tails.factors(energy_kev, rng)
-            drawn += factors[:, np.newaxis] * self.tails.decay(length).astype(np.float32)
-        return drawn
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,8 +301,7 @@ class InTracePileUp:
 
     def reach(self, dt_ns: float) -> int:
         """Number of samples beyond a record that `added` needs for the earliest pulse."""
-        earliest = float(self.after_ns.min(initial=0.0))
-        return int(np.ceil(-min(earliest, 0.0) / dt_ns)) + 1
+        return int(np.ceil(-self.after_ns.min(initial=0.0) / dt_ns)) + 1
 
     def added(
         self, shapes: npt.NDArray[np.floating], energy_kev: Values, dt_ns: float, length: int

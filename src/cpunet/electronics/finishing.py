@@ -13,8 +13,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import TraceNoise
-from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.preparation import Codes, Prepared, prepare
@@ -114,7 +112,7 @@ def finish(
     config: PreparationConfig,
     *,
     dt_ns: float,
-    noise: BaselineNoise | TraceNoise | None = None,
+    noise: BaselineNoise | None = None,
     energy_kev: npt.NDArray[np.float64] | None = None,
     seed: int | np.random.Generator = 0,
     added: npt.NDArray[np.float64] | None = None,
@@ -136,8 +134,8 @@ def finish(
     dt_ns
         Sampling period in ns.
     noise
-        Noise to add, with or without the pile-up tails. None for noise-free
-        windows.
+        Noise to add, of the same sampling period, with or without pile-up tails. None for
+        noise-free windows.
     energy_kev
         Energy of each pulse in keV, shape ``(n,)``. Required for noise.
     seed
@@ -151,13 +149,8 @@ def finish(
     Raises
     ------
     CpunetError
-        If the noise has another sampling period, or an energy is not above 0.
+        If an energy is not above 0.
     """
-    if noise is not None and not np.isclose(noise.dt_ns, dt_ns):
-        raise CpunetError(
-            f"the noise is sampled every {noise.dt_ns:g} ns, the pulses every {dt_ns:g} ns; "
-            "take it from the data of the fit"
-        )
     # A noise-free record may have equal samples at its top; none of them is clipped.
     config = config.at(dt_ns).model_copy(update={"saturation_run": records.shape[1] + 1})
     rng, n = np.random.default_rng(seed), len(records)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import logging
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import SIZES_KEV, DrawnTails, TraceNoise, tail_shape
+from cpunet.electronics.drawn_pile_up import SIZES_KEV, DrawnTails, tail_shape
 from cpunet.electronics.finishing import padding
 from cpunet.electronics.pile_up_tails import PileUpTails, TailsInfo
 from cpunet.errors import CpunetError
-from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.preparation import CutWindows, apply_cuts, prepare
@@ -27,7 +26,7 @@ MIN_EMPTY = 200  # minimum number of these if traces with tails are left out
 TEMPLATES, MIN_TEMPLATES = 150, 20  # traces to which tails are added
 
 
-def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, TailsInfo]:
+def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[BaselineNoise, TailsInfo]:
     """Measure noise and pile-up tails in the data of a training, and note the result.
 
     Parameters
@@ -49,11 +48,13 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
         If there are too few flat baselines.
     """
     pile_up, reason = tails_of(data)
+    noise, dt_ns, passed = noise_of(data, pile_up), data.dt_ns, None
     if pile_up is None:
         log.info(f"pile-up tails are not measured: {reason}")
-        return TraceNoise(noise_of(data)), TailsInfo(missing=reason)
+        return noise, TailsInfo(missing=reason)
     # tails to draw like those of the data behind their quality cuts
-    law, whole, dt_ns, passed = pile_up.law, _baselines(data).whole, data.dt_ns, None
+    assert data.baselines is not None  # of which the tails are
+    law, whole = pile_up.law, data.baselines.whole
     if data.cuts is not None and whole is not None and law is not None:
         passed = passing(pile_up, whole, config, data.cuts)
     before = config.at(dt_ns).samples_before + padding(dt_ns)[0]
@@ -63,7 +64,7 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
     drawn = DrawnTails(**asdict(pile_up.fit.law) | of_windows)
     info = pile_up.describe().model_copy(update={"drawn": plain(asdict(drawn))})
     if law is None:
-        return TraceNoise(noise_of(data, pile_up)), info
+        return noise, info
     slopes = " (by slopes alone: levels do not follow the tilts)"
     log.info(
         f"pile-up tails: {with_std(info.rate_khz, info.rate_error_khz)} kHz"
@@ -71,7 +72,7 @@ def trace_noise(data: InputSet, config: PreparationConfig) -> tuple[TraceNoise, 
         f"{info.percent_above['10_kev']['law']:.2g} % of the traces above 10 keV; "
         "translations are given them"
     )
-    return TraceNoise(noise_of(data, pile_up), drawn), info
+    return replace(noise, tails=drawn), info
 
 
 def passing(
@@ -106,8 +107,9 @@ def passing(
 
 def tails_of(data: InputSet) -> tuple[PileUpTails | None, str | None]:
     """Pile-up tails of the data and None, or None and why they cannot be estimated."""
+    assert data.baselines is not None  # these are measured pulses
     try:
-        return PileUpTails.of(_baselines(data)), None
+        return PileUpTails.of(data.baselines), None
     except CpunetError as error:
         return None, str(error)
 
@@ -122,16 +124,11 @@ def noise_of(data: InputSet, tails: PileUpTails | None = None) -> BaselineNoise:
     CpunetError
         If the baselines are too few or too short.
     """
-    baselines = _baselines(data)
-    first = baselines.first
+    assert data.baselines is not None  # these are measured pulses
+    first = data.baselines.first
     usable = np.isfinite(first.energy_kev) & (first.energy_kev > 0)
     usable[NOISE_TRACES:] = False
     if tails is not None and tails.law is not None:
         empty = usable & tails.empty(first)
         usable = empty if empty.sum() >= MIN_EMPTY else usable
-    return BaselineNoise.of(baselines, usable)
-
-
-def _baselines(data: InputSet) -> Baselines:
-    assert data.baselines is not None  # these are measured pulses
-    return data.baselines
+    return BaselineNoise.of(data.baselines, usable)

@@ -32,6 +32,7 @@ from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import scipy.special
 from iminuit import Minuit
 from pydantic import Field
 from scipy.stats import median_abs_deviation
@@ -84,37 +85,6 @@ STARTS = 0.005, 0.1  # pulses per decay time at which fits begin
 # coarse), of the spectrum, and of the wings.
 EXPECTED, SIGMA, SPECTRUM = (-20.0, 6.0), (-1.0, 8.0), ((0.0, 10.0), (-2.0, 2.0))
 WINGS = -5.0, 5.0
-
-
-def usable(baselines: Baselines) -> tuple[FloatArray, float, float]:
-    """Baselines of one length, the gain in ADC counts per keV, and the decay of tails in us.
-
-    Raises
-    ------
-    CpunetError
-        If too few traces can be prepared or have a known energy, the baselines are too short,
-        or the pulses do not decay.
-    """
-    prepared, length = baselines.prepared, baselines.length
-    with np.errstate(divide="ignore"):  # an energy of 0 is left out
-        gains = baselines.height / prepared.pulses.energy_kev
-    gains = gains[np.isfinite(gains) & (gains > 0)]
-    if len(gains) < MIN_BASELINES:
-        reasons = "".join(f", {n} {reason}" for reason, n in prepared.rejections.items())
-        raise CpunetError(
-            f"only {len(gains)} of {len(baselines)} traces can be prepared and have a known "
-            f"energy{reasons}; {MIN_BASELINES} or more are needed to tell pile-up tails"
-        )
-    if length < MIN_SAMPLES:
-        raise CpunetError(
-            f"{length} samples before pulses are too few for tails; give {MIN_SAMPLES} or more"
-        )
-    large = prepared.scale >= np.median(prepared.scale)
-    slope = float(np.median(prepared.tail_slope[large]))
-    if not slope < 0:
-        raise CpunetError("the tails of the traces do not decay; are these measured traces?")
-    values = baselines.first.waveforms[:, :length].astype(float)
-    return values, float(np.median(gains)), -1e3 / slope
 
 
 def read_baselines(
@@ -180,10 +150,8 @@ def mode(values: FloatArray) -> float:
     ordered = np.sort(values)
     while len(ordered) > 8:
         half = len(ordered) // 2
-        first = int(np.argmin(ordered[half:] - ordered[: len(ordered) - half]))
+        first = int(np.argmin(ordered[half:] - ordered[:-half]))
         ordered = ordered[first : first + half + 1]
-        if ordered[-1] == ordered[0]:
-            break
     return float(ordered.mean())
 
 
@@ -203,8 +171,6 @@ class RateFit:
         The law, and the standard error of its rate in kHz.
     level_kev, sigma_kev
         Level of an empty baseline and spread of traces about it, in keV.
-    recorded
-        Whether the law uses the energies of the file rather than a fitted spectrum.
     gain_of_law
         Log-likelihood relative to that without any tails.
     """
@@ -213,7 +179,6 @@ class RateFit:
     rate_error_khz: float
     level_kev: float
     sigma_kev: float
-    recorded: bool
     gain_of_law: float
 
 
@@ -228,11 +193,8 @@ class TailsInfo(InfoPart):
     drawn: dict[str, Any] | None = None
     rate_error_khz: float = 0.0
     decay_us: float = 0.0
-    decay_error_us: float | None = None
     error_kev: float = 0.0
     told_by: str = ""
-    energies: str = ""
-    traces: int = 0
     percent_above: dict[str, dict[str, float]] = Field(default_factory=dict)
     missing: str | None = None
 
@@ -266,9 +228,8 @@ class PileUpTails:
         slope is the complement.
     level_error_kev
         Standard deviation of the tail from the level alone, in keV.
-    decay_us, decay_error_us
-        Decay time of the tails and its error in us. The error is None if the decay time
-        is that of the pulses' tails.
+    decay_us
+        Decay time of the tails in us.
     level_adc, adc_per_kev
         Most frequent level of a baseline in ADC counts, and gain in ADC counts per keV.
     widest_adc
@@ -285,7 +246,6 @@ class PileUpTails:
     level_weight: float
     level_error_kev: float
     decay_us: float
-    decay_error_us: float | None
     level_adc: float
     adc_per_kev: float
     widest_adc: float
@@ -335,8 +295,28 @@ class PileUpTails:
             If the baselines are too short, the energies are unknown, or too few traces can
             be used.
         """
-        values, gain, decay = usable(baselines)
-        dt_ns, samples, error = baselines.first.dt_ns, values.shape[1], None
+        prepared, samples, dt_ns = baselines.prepared, baselines.length, baselines.first.dt_ns
+        with np.errstate(divide="ignore"):  # an energy of 0 is left out
+            gains = baselines.height / prepared.pulses.energy_kev
+        gains = gains[np.isfinite(gains) & (gains > 0)]
+        if len(gains) < MIN_BASELINES:
+            reasons = "".join(f", {n} {reason}" for reason, n in prepared.rejections.items())
+            raise CpunetError(
+                f"only {len(gains)} of {len(baselines)} traces can be prepared and have a "
+                f"known energy{reasons}; {MIN_BASELINES} or more are needed to tell pile-up "
+                "tails"
+            )
+        if samples < MIN_SAMPLES:
+            raise CpunetError(
+                f"{samples} samples before pulses are too few for tails; give {MIN_SAMPLES}"
+            )
+        slopes = prepared.tail_slope[prepared.scale >= np.median(prepared.scale)]
+        if not (slope := float(np.median(slopes))) < 0:
+            raise CpunetError("the traces' tails do not decay; are these measured traces?")
+        gain, decay = float(np.median(gains)), -1e3 / slope
+        values = baselines.first.waveforms[:, :samples].astype(float)
+
+        # the decay time is that of large tails, if levels follow them
         mean, left, width = read_baselines(values, dt_ns, decay)
         quiet = width <= widest_of(width)
         level = mode(mean[quiet])
@@ -352,21 +332,18 @@ class PileUpTails:
             fall = np.log(first[positive] / second[positive])
             if len(fall) >= MIN_LARGE and (middle := float(np.median(fall))) > 0:
                 decay = half * dt_ns * 1e-3 / middle
-                spread = 1.2533 * float(median_abs_deviation(fall, scale="normal"))
-                error = decay * spread / middle / float(np.sqrt(len(fall)))
+
         # tails by slope and by level, weighted by their errors
         of_slope, of_level, width = tails_kev(values, dt_ns, decay, level, gain)
         quiet = width <= (widest := widest_of(width))
         slope_error = lower_spread(of_slope[quiet])
         level_error = lower_spread(of_level[quiet]) if coupled else np.inf
-        weight = slope_error**2 / (slope_error**2 + level_error**2) if coupled else 0.0
+        weight = slope_error**2 / (slope_error**2 + level_error**2)
         kev = (1 - weight) * of_slope + weight * of_level
         guess = (slope_error**-2.0 + level_error**-2.0) ** -0.5
         fit = fit_rate(kev[quiet], guess, decay, baselines.first.energy_kev)
         kev = np.where(quiet, kev - fit.level_kev, np.nan)
-        tails = cls(
-            kev, weight, level_error, decay, error, level, gain, widest, fit, samples, dt_ns
-        )
+        tails = cls(kev, weight, level_error, decay, level, gain, widest, fit, samples, dt_ns)
         # with many tails and no precise rate, the level of empty baselines is not seen either
         most = MAX_FULL if tails.law else MAX_UNSURE
         if float(fit.law.share_above(fit.sigma_kev)) > most:
@@ -395,25 +372,22 @@ class PileUpTails:
 
     def describe(self) -> TailsInfo:
         """Summary: the rate, its error, and fractions of traces above several thresholds."""
-        with_level = self.kev[np.isfinite(self.kev)]
         law, surely = self.fit.law, self.law is not None
-        of_law = law.share_above(SHARES_KEV) if surely else np.zeros(len(SHARES_KEV))
+        measured = self.kev[np.isfinite(self.kev)]
+        percent = {
+            f"{kev:g}_kev": {
+                "measured": round(100 * float((measured > kev).mean()), 2),
+                "law": round(100 * float(law.share_above(kev)), 2) if surely else 0.0,
+            }
+            for kev in SHARES_KEV
+        }
         return TailsInfo(
             rate_khz=law.rate_khz if surely else 0.0,
             rate_error_khz=self.fit.rate_error_khz,
             decay_us=self.decay_us,
-            decay_error_us=self.decay_error_us,
             error_kev=self.fit.sigma_kev,
             told_by="level and slope" if self.level_weight else "slope",
-            energies="recorded" if self.fit.recorded else "learned from the tails",
-            traces=len(with_level),
-            percent_above={
-                f"{kev:g}_kev": {
-                    "measured": round(100 * float((with_level > kev).mean()), 2),
-                    "law": round(100 * float(share), 2),
-                }
-                for kev, share in zip(SHARES_KEV, of_law, strict=True)
-            },
+            percent_above=percent,
         )
 
 
@@ -441,8 +415,6 @@ def characteristic_exponents(u: FloatArray, energies_kev: FloatArray) -> Complex
     >>> characteristic_exponents(np.array([1e-5]), np.array([100.0])).imag.round(6).tolist()
     [[0.001]]
     """
-    import scipy.special  # a fifth of a second, for those who look for tails only
-
     phase = np.maximum(u[:, np.newaxis] * energies_kev, 1e-12)
     sine, cosine = scipy.special.sici(phase)
     return np.asarray(1j * sine - (np.euler_gamma + np.log(phase) - cosine))
@@ -518,7 +490,6 @@ def fit_rate(
         rate_error_khz=khz * fit.errors[0],
         level_kev=float(values[1]),
         sigma_kev=float(np.exp(values[2])),
-        recorded=len(values) == len(limits),
         gain_of_law=without.fval - fit.fval,
     )
 
@@ -542,15 +513,11 @@ def _likelihood(
     floor = OUTLIERS / max(float(np.ptp(kev)), step)
 
     def likelihood(expected: float, level: float, sigma: float, weights: FloatArray) -> float:
-        # beyond this the noise term is negligible; shorter arrays are also allocated faster
+        # beyond this the noise term is negligible
         u = arguments[: np.searchsorted(arguments, NEGLIGIBLE / sigma)]
-        parts = weights @ exponents[:, : 2 * len(u)]
-        parts *= expected
+        exponent = (expected * (weights @ exponents[:, : 2 * len(u)])).view(np.complex128)
         squares = -0.5 * (sigma * u) ** 2
-        parts[::2] += squares
-        parts[1::2] -= u * (level + first * step)
-        spectrum = parts.view(np.complex128)
-        np.exp(spectrum, out=spectrum)
+        spectrum = np.exp(exponent + squares - 1j * (u * (level + first * step)))
         if wings:
             spectrum *= 1 - wings + wings * np.exp((widths**2 - 1) * squares)
         density = np.maximum(np.fft.irfft(spectrum, points) / step, 0.0)
@@ -564,27 +531,26 @@ def _wings(kev: FloatArray, sigma_kev: float) -> tuple[float, float]:
     """Fraction and relative width of a second, wider Gaussian fitted to the side below 0."""
     below, start = kev[kev < 0], float(np.log(sigma_kev))
     limits = [(start + WINGS[0], start + WINGS[1]), WINGS, WINGS]
+    if len(below) < MIN_BELOW:
+        return 0.0, 1.0
 
-    def cost(sigma: float, share: float, width: float) -> float:
+    def in_ranges(values: Sequence[float]) -> tuple[float, float, float]:
+        return np.exp(values[0]), MAX_WINGS / (1 + np.exp(-values[1])), 1.5 + np.exp(values[2])
+
+    def cost(values: Sequence[float]) -> float:
+        sigma, share, width = in_ranges(values)
         core, wide = below / sigma, below / (width * sigma)
         density = (1 - share) * np.exp(-0.5 * core**2) + share / width * np.exp(-0.5 * wide**2)
         return -float(np.log(density / sigma + 1e-30).sum())
 
-    def in_ranges(values: FloatArray) -> tuple[float, float, float]:
-        return np.exp(values[0]), MAX_WINGS / (1 + np.exp(-values[1])), 1.5 + np.exp(values[2])
-
-    if len(below) < MIN_BELOW:
-        return 0.0, 1.0
-    alone = _best(lambda v: cost(np.exp(v[0]), 0.0, 1.0), [[start]], limits[:1])
-    wide = _best(lambda v: cost(*in_ranges(v)), [[start, -1.0, 0.0]], limits)
-    if wide.fval > alone.fval - WORTH:
-        return 0.0, 1.0
-    _, share, width = in_ranges(np.array(wide.values))
-    return float(share), float(width)
+    # without wings the logarithm of their fraction is minus infinity
+    alone = _best(lambda v: cost([*v, -np.inf, 0.0]), [[start]], limits[:1])
+    wide = _best(cost, [[start, -1.0, 0.0]], limits)
+    return in_ranges(wide.values)[1:] if wide.fval <= alone.fval - WORTH else (0.0, 1.0)
 
 
 def _best(
-    cost: Callable[[FloatArray], float],
+    cost: Callable[[Any], float],
     starts: Sequence[Sequence[float]],
     limits: Sequence[tuple[float, float] | None],
 ) -> Minuit:

@@ -223,48 +223,6 @@ def coloured_noise(
     return noise
 
 
-def draw_other_pulses(
-    pulses: Pulses, electronics: Electronics, rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray, InTracePileUp]:
-    """Draw the other pulses of each trace, see `cpunet.electronics.chain`.
-
-    Parameters
-    ----------
-    pulses
-        Pulses of the traces. Piled-up pulses take their shapes.
-    electronics
-        The readout chain with the rates.
-    rng
-        Random generator.
-
-    Returns
-    -------
-    tuple
-        Signal in keV that is added to each trace, shape ``(n, length)``; sum of the pile-up
-        tails at the first sample of each, in keV; piled-up pulses in the traces.
-    """
-    tails, within = rng.spawn(2)
-    # pile-up tails with all decays of the chain: a step response is a sum of exponentials, and
-    # so is the sum of many tails
-    n, transfer, dt_ns = len(pulses), electronics.transfer, electronics.dt_ns
-    longest_us = LIFETIMES * max(part.tau_us for part in electronics.decays)
-    rate_khz, energies_kev = electronics.earlier_pulses.rate_kHz, electronics.other_pulses_kev
-    row, kev, before_us = earlier_pulses(n, rate_khz, longest_us, energies_kev, tails)
-    modes = kev[:, np.newaxis] * np.exp(1e3 * before_us[:, np.newaxis] * transfer.poles)
-    heights = np.zeros((n, len(transfer.poles)), np.complex128)
-    np.add.at(heights, row, modes * (transfer.residues / transfer.poles))
-    centres_ns = (np.arange(electronics.length) + 0.5) * dt_ns
-    decays = np.exp(transfer.poles[:, np.newaxis] * centres_ns)
-    added_kev = np.ascontiguousarray((heights @ decays).real)
-    tails_kev = added_kev[:, 0].copy()  # before piled-up pulses are added
-    rate_khz, record = electronics.pile_up.rate_kHz, (electronics.n_pre, electronics.length)
-    piled = InTracePileUp.draw(n, rate_khz, energies_kev, dt_ns, *record, within)
-    # with shapes of randomly chosen pulses
-    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
-    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
-    return added_kev, tails_kev, piled
-
-
 FLAGS = {"decaying baseline": 1, "pile-up": 2, "saturated": 4}
 """Bits of a trace's flags. A baseline decays if its tail exceeds the noise RMS."""
 
@@ -275,30 +233,23 @@ class RawTraces(Pulses):
 
     Parameters
     ----------
-    flag
-        Uint8 sum of 1 (decaying baseline), 2 (pile-up) and 4 (saturated).
     response
         Noise-free pulses at their own clock phase in units of the full charge, without
         baseline and without earlier or piled-up pulses. Float32, shape ``(n, length)``.
     true_energy_kev, baseline_adc
         Scale in keV and offset in ADC counts of each pulse.
-    tails_kev
-        Sum of the pile-up tails at the first sample of each trace, in keV.
-    n_piled
-        Number of additional pulses within each trace.
-    piled_kev, piled_ns
-        Energy of the largest additional pulse, and its start after that of the trace's own
-        pulse in ns (negative: before it). NaN where there is none.
+    disturbed
+        How each trace is disturbed, arrays of shape ``(n,)``. ``flag``: uint8 sum of 1
+        (decaying baseline), 2 (pile-up) and 4 (saturated); ``tails_kev``: sum of the pile-up
+        tails at the first sample; ``n_piled``: number of additional pulses within the trace;
+        ``piled_kev``, ``piled_ns``: energy of the largest of these, and its start after that
+        of the trace's own pulse (negative: before it), NaN where there is none.
     """
 
-    flag: npt.NDArray[np.uint8]
     response: npt.NDArray[np.float32]
     true_energy_kev: FloatArray
     baseline_adc: FloatArray
-    tails_kev: FloatArray
-    n_piled: npt.NDArray[np.int64]
-    piled_kev: FloatArray
-    piled_ns: FloatArray
+    disturbed: dict[str, npt.NDArray[Any]]
 
 
 def by_height(
@@ -354,24 +305,47 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
     >>> traces.waveforms.shape, traces.waveforms.dtype
     ((2, 1400), dtype('uint16'))
     """
-    energy, n = pulses.energy_kev, len(pulses)
+    energy, n, transfer = pulses.energy_kev, len(pulses), electronics.transfer
+    dt_ns, length, n_pre = electronics.dt_ns, electronics.length, electronics.n_pre
     require_energies(energy, pulses.event_number)
     clock, others, noise, level, resolution = np.random.default_rng(seed).spawn(5)
     # a uniform clock phase plus trigger jitter
-    shift_ns = clock.uniform(0, electronics.dt_ns, size=n)
+    shift_ns = clock.uniform(0, dt_ns, size=n)
     shift_ns += clock.normal(0, electronics.trigger_jitter_ns, size=n)
     response = linear_response(pulses, electronics, shift_ns)
-    added_kev, tails_kev, piled = draw_other_pulses(pulses, electronics, others)
-    n_piled, piled_kev, piled_ns = (values for values, _ in piled.columns().values())
-    own, dt_ns = electronics.noise, electronics.dt_ns
-    unit = coloured_noise(own.spectrum, n, electronics.length, dt_ns, noise)
+
+    # pile-up tails with all decays of the chain: a step response is a sum of exponentials, and
+    # so is the sum of many tails
+    tails, within = others.spawn(2)
+    longest_us = LIFETIMES * max(part.tau_us for part in electronics.decays)
+    rate_khz, energies_kev = electronics.earlier_pulses.rate_kHz, electronics.other_pulses_kev
+    row, kev, before_us = earlier_pulses(n, rate_khz, longest_us, energies_kev, tails)
+    modes = kev[:, np.newaxis] * np.exp(1e3 * before_us[:, np.newaxis] * transfer.poles)
+    heights = np.zeros((n, len(transfer.poles)), np.complex128)
+    np.add.at(heights, row, modes * (transfer.residues / transfer.poles))
+    centres_ns = (np.arange(length) + 0.5) * dt_ns
+    decays = np.exp(transfer.poles[:, np.newaxis] * centres_ns)
+    added_kev = np.ascontiguousarray((heights @ decays).real)
+    tails_kev = added_kev[:, 0].copy()  # before piled-up pulses are added
+
+    # in-trace pile-up, with shapes of randomly chosen pulses
+    rate_khz = electronics.pile_up.rate_kHz
+    piled = InTracePileUp.draw(n, rate_khz, energies_kev, dt_ns, n_pre, length, within)
+    shapes = linear_response(pulses[piled.partner], electronics, piled.after_ns)
+    np.add.at(added_kev, piled.row, piled.kev[:, np.newaxis] * shapes)
+    disturbed = {name: values for name, (values, _) in piled.columns().items()}
+    disturbed["piled_ns"] -= shift_ns
+
+    own = electronics.noise
+    unit = coloured_noise(own.spectrum, n, length, dt_ns, noise)
     total_kev = energy[:, None] * response + added_kev + unit * np.float32(own.rms_kev)
     total_kev = by_height(total_kev, electronics)
     mean, spread = electronics.baseline_mean_adc, electronics.baseline_spread_adc
     baseline = level.normal(mean, spread, size=n)
     adc = np.rint(baseline[:, None] + electronics.gain_adc_per_kev * total_kev)
     beyond = (adc > electronics.adc_top) | (adc < 0)
-    flags = tails_kev > own.rms_kev, n_piled > 0, beyond.any(axis=1)
+    flags = tails_kev > own.rms_kev, disturbed["n_piled"] > 0, beyond.any(axis=1)
+    flag = np.asarray([*FLAGS.values()] @ np.array(flags), np.uint8)
     # the resolution grows with the root of the energy
     fwhm_kev = np.sqrt(electronics.resolution_fwhm_kev**2 / REFERENCE_KEV * energy)
     smeared = np.random.default_rng(int(resolution.integers(2**63)))
@@ -382,12 +356,8 @@ def read_out(pulses: Pulses, electronics: Electronics, seed: int) -> RawTraces:
         event_number=pulses.event_number,
         peak=pulses.peak,
         t0_ns=np.zeros(n),
-        flag=np.asarray([*FLAGS.values()] @ np.array(flags), np.uint8),
         response=by_height(response, electronics, energy[:, None]).astype(np.float32),
         true_energy_kev=energy,
         baseline_adc=baseline,
-        tails_kev=tails_kev,
-        n_piled=n_piled,
-        piled_kev=piled_kev,
-        piled_ns=piled_ns - shift_ns,
+        disturbed={"flag": flag, "tails_kev": tails_kev, **disturbed},
     )

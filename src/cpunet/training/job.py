@@ -169,13 +169,13 @@ def train_chain(job: TrainingJob, start: ElectronicsResponse | None = None) -> R
 
         noise, tails = trace_noise(job.data, recipe.preparation)
         pulses, rng = (sim, job.data.prepared.pulses), np.random.default_rng(job.seed)
-        sets = PulseSets(*pulses, noise.noise, recipe, rng, noise.tails, job.continuum)
+        sets = PulseSets(*pulses, noise, recipe, rng, job.continuum)
         fitter = Fitter(recipe.matching.training, listen)
         response, info = fit_response(sets, fitter, start)
     chain = ResponseGenerator(response.config, job.sim.dt_ns)
     chain.response, chain.tails = response, noise.tails
-    chain.set_noise(noise.noise)
-    n, rms, error = noise.noise.n_baselines, noise.noise.rms, noise.noise.rms_error
+    chain.set_noise(noise)
+    n, rms, error = noise.n_baselines, noise.rms, noise.rms_error
     of_noise = {"baselines": n, "rms": rms, "rms_error": error}
     info = info.model_copy(update={"noise": of_noise, "tails": tails})
     _say(info)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +14,7 @@ import torch
 from torch import nn
 from torch.optim.swa_utils import update_bn
 
-from cpunet.electronics.drawn_pile_up import TraceNoise
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import finish
 from cpunet.electronics.measured import trace_noise
 from cpunet.errors import CpunetError
@@ -100,7 +101,7 @@ def train_networks(job: TrainingJob) -> Run:
     parts |= {f"discriminator_{side}": critic for side, critic in game.critics.items()}
     if noise is not None:
         parts["noise"] = KeptNoise(noise.dt_ns)
-        parts["noise"].set_noise(noise.noise)
+        parts["noise"].set_noise(noise)
     more: dict[str, Any] = {"resumed_at": run.resumed_at, "fit": info}
     more = {name: value for name, value in more.items() if value}
     return job.run(parts, recipe, run.started, run.clock, log=run.records, **more)
@@ -116,7 +117,7 @@ def _played(
     job: TrainingJob,
     recipe: Recipe,
     make: Callable[[], Mapping[str, Generator]],
-    noise: TraceNoise | None,
+    noise: BaselineNoise | None,
 ) -> tuple[Game, UnfinishedRun]:
     """Play the game of a recipe, or the rest of it, with all that is needed to resume it."""
     settings = recipe.cyclegan
@@ -197,7 +198,7 @@ def learned_residuals(
         return {}, {"networks": f"left out; {why}"}, []
     response = SolvedResponse(chain.response, recipe.preparation)
     linear = {"ren": response, "iren": SolvedInverse(inverse)}
-    noise = TraceNoise(chain.noise, chain.tails)
+    noise = replace(chain.noise, tails=chain.tails)
     game, run = _played(job, recipe, partial(generators, recipe, linear=linear), noise)
     parts, gains = dict[str, Residual](), dict[str, str]()
     for name, (scale, line) in (

@@ -21,7 +21,6 @@ import numpy.typing as npt
 import scipy.fft
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
-from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
@@ -221,7 +220,6 @@ class Noise:
         length: int,
         pairs: int,
         rng: np.random.Generator,
-        tails: DrawnTails | None = None,
     ) -> Noise:
         """Draw noise for records of `length` samples.
 
@@ -230,7 +228,7 @@ class Noise:
         """
         n = len(energy_kev)
         n_traces = min(NOISE_TRACES, n * pairs)
-        traces = noise.draw(np.ones(n_traces), 2 * length, rng)
+        traces = replace(noise, tails=None).draw(np.ones(n_traces), 2 * length, rng)
         # each trace is used before any is used again
         trace = np.concatenate(
             [rng.permutation(n_traces) for _ in range(-(-n * pairs // n_traces))]
@@ -240,7 +238,7 @@ class Noise:
         start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
         factor = np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev
         left = decay = None
-        if tails is not None:
+        if (tails := noise.tails) is not None:
             left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
             decay = np.asarray(tails.decay(length), np.float32)
         return cls(traces, trace, start, np.asarray(factor, np.float32), left, decay)
@@ -444,13 +442,11 @@ class PulseSets:
     sim, data
         Prepared pulses with their energies.
     noise
-        Noise of the data's baselines.
+        Noise of the data's baselines, with their pile-up tails.
     recipe
         Recipe that matches a response.
     rng
         Random generator that chooses the subsets and draws the noise.
-    tails
-        Pile-up tails in the data.
     continuum
         Reads the pulses of both sides away from all lines, for `single_sites`.
 
@@ -472,7 +468,6 @@ class PulseSets:
     noise: BaselineNoise
     recipe: Recipe
     rng: np.random.Generator
-    tails: DrawnTails | None = None
     continuum: Continuum | None = None
 
     def __post_init__(self) -> None:
@@ -511,7 +506,7 @@ class PulseSets:
             rows = rows[np.searchsorted(share, (np.arange(len(rows)) + 0.5) / len(rows))]
         sim, measured = sim[rows], data.waveforms[band.data[:MOST]]
         length, pairs = record_length(sim.length, sim.dt_ns), max(1, round(NOISES / len(sim)))
-        noise = Noise.draw(self.noise, sim.energy_kev, length, pairs, self.rng, self.tails)
+        noise = Noise.draw(self.noise, sim.energy_kev, length, pairs, self.rng)
         finite = np.isfinite(measured).all(axis=1)
         return Sides(sim, measured[finite], noise, self.recipe, band.name, rows)
 

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d, conv1d, pad
 
-from cpunet.electronics.drawn_pile_up import TraceNoise
+from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.finishing import padding
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import ConvolutionalConfig, GruConfig, PreparationConfig
@@ -81,7 +81,7 @@ class Sides(NamedTuple):
     sim: Side
     data: Side
     preparation: PreparationConfig
-    noise: TraceNoise | None
+    noise: BaselineNoise | None
     scaled: bool
 
     def noisy(self, pulses: Tensor, rows: Tensor) -> Tensor:

@@ -15,19 +15,17 @@ import logging
 from collections import defaultdict
 from collections.abc import Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from cpunet.electronics.baseline_methods import BaselineMethod
+from cpunet.electronics.baseline_methods import BASELINE_METHODS, BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import TraceNoise
 from cpunet.electronics.finishing import Finished, finish
 from cpunet.electronics.measured import noise_of, tails_of
-from cpunet.electronics.superpulses import BASELINE_METHODS
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.progress import stage
@@ -151,7 +149,7 @@ class FittedBaselineMethods:
     """
 
     methods: dict[str, BaselineMethod] = field(default_factory=dict)
-    noise: BaselineNoise | TraceNoise | None = None
+    noise: BaselineNoise | None = None
     missing: dict[str, str] = field(default_factory=dict)
 
 
@@ -181,8 +179,7 @@ def fit_baseline_methods(
         tails = None
     measured_tails = None if tails is None else tails_of(data)[0]
     try:
-        noise = noise_of(data, measured_tails)
-        result.noise = noise if tails is None else TraceNoise(noise, tails)
+        result.noise = replace(noise_of(data, measured_tails), tails=tails)
     except CpunetError as error:
         result.missing["noise"] = str(error)
     pulses = [side.prepared.pulses for side in (sim, data)]

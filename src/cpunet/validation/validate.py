@@ -278,7 +278,7 @@ def evaluate(
         ),
         a_over_e_scale=scales,
         baseline_methods={
-            "fits": {name: of.describe() for name, of in fits.methods.items()},
+            "fits": {name: of.values for name, of in fits.methods.items()},
             "missing": fits.missing,
         },
         training={"recipe": recipe.name}
