@@ -27,7 +27,7 @@ from cpunet.training.adversarial import (
     window_weights,
 )
 from cpunet.training.network_runs import settle
-from cpunet.training.views import RECENT, SHARP, Judge, View, aligned, nominal
+from cpunet.training.views import RECENT, SHARP, Judge, View, aligned
 from games import as_published, game_of, mended, windows
 from synthetic import LOSS_NAMES, interrupted_in, load_recipe
 
@@ -344,6 +344,6 @@ def test_a_step_response_is_learned_from_unpaired_pulses():
     game = train(partial(game_of, recipe, n=1500), 0)
     ren, (sim, data) = game.average["ren"], (side.pulses for side in game.sides[:2])
     with torch.no_grad():
-        made = aligned(nominal(ren(sim), recipe.preparation), recipe.preparation)
+        made = aligned(game.sides.prepared(ren(sim)), recipe.preparation)
         apart = made.mean(dim=0) - aligned(data, recipe.preparation).mean(dim=0)
     assert float(apart.square().mean().sqrt()) < 5e-3

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import dataclasses
 from types import SimpleNamespace
 from typing import NamedTuple
 
@@ -169,7 +168,7 @@ def test_derivatives_of_a_fit_are_those_of_differences(problem: Problem) -> None
     config = generator.model_copy(update={"poles_ns": (55.0, 35.0), "drift_terms": 1})
     start = ElectronicsResponse(config.model_copy(update={"decay_us": 80.0}), DT_NS)
     (sides,) = PulseSets(*problem[:3], RECIPE, np.random.default_rng(0)).sides()
-    sides.noise = dataclasses.replace(sides.noise, factor=1e-3 * sides.noise.factor)
+    sides.noise.factor = 1e-3 * sides.noise.factor
     parameters = SmoothParameters(start)
     place, compared = parameters.vector(), Joint(sides)
     here = differences(parameters, compared)
@@ -200,7 +199,7 @@ def test_derivatives_of_the_same_pulses_do_not_pull_a_fit() -> None:
         of_parts, values = (
             of.reshape(20, n // 20, *of.shape[1:]).mean(axis=1) for of in (slopes, each)
         )
-        same = Difference("joint", off, covariance, slopes.mean(axis=0), (of_parts, values))
+        same = Difference(off, covariance, slopes.mean(axis=0), (of_parts, values))
         gradients.append(same.slopes[:, 0] @ np.linalg.solve(covariance, off))
         shared.append(same.shared[0])
     error = np.std(gradients) / experiments**0.5
@@ -255,7 +254,7 @@ def test_the_peak_of_single_sites_does_not_depend_on_the_mixture() -> None:
 @pytest.mark.parametrize("shift", [0.0, 0.002, -0.05])
 def test_the_shift_of_amplitudes_is_told(shift: float) -> None:
     covariance = 1e-6 * (np.eye(16) + 0.5)
-    quantiles = Difference("log_amplitude quantiles", np.full(16, -shift), covariance)
+    quantiles = Difference(np.full(16, -shift), covariance)
     found, error = amplitude_shift([quantiles])
     assert found == pytest.approx(shift)
     assert error == pytest.approx((1e-6 * (1 / 16 + 0.5)) ** 0.5)

@@ -9,7 +9,6 @@ equally), and current amplitudes (a readout only makes pulses slower).
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -158,10 +157,7 @@ class CheckResult:
             lines.append(f"{finding.level:<7}{finding}")
         return "\n".join(lines)
 
-    def __repr__(self) -> str:
-        counts = Counter(finding.level for finding in self.findings)
-        text = ", ".join(f"{n} {mark}" for mark, n in counts.items())
-        return f"<{type(self).__name__}: {text}>"
+    __repr__ = __str__
 
 
 def check(

@@ -69,8 +69,6 @@ class Difference:
 
     Parameters
     ----------
-    name
-        What is compared.
     values, covariance
         Differences, and their covariance.
     slopes
@@ -78,20 +76,21 @@ class Difference:
     parts
         Derivatives (parts, functions, coordinates) and differences (parts, functions) of equal
         parts of the simulated pulses.
+    sliced
+        Whether it is a slice.
     """
 
-    name: str
     values: Values
     covariance: Values
     slopes: Values = field(default_factory=lambda: NONE)
     parts: tuple[Values, Values] | None = None
+    sliced: bool = False
 
     @property
     def chi_square(self) -> float:
         """Per function."""
-        return float(self.values @ np.linalg.solve(self.covariance, self.values)) / len(
-            self.values
-        )
+        solved = np.linalg.solve(self.covariance, self.values)
+        return float(self.values @ solved) / len(self.values)
 
     @property
     def white(self) -> tuple[Values, Values]:
@@ -111,11 +110,6 @@ class Difference:
         slopes, values = self.parts
         n, off = len(values), np.linalg.solve(self.covariance, (values - values.mean(axis=0)).T)
         return np.asarray(np.einsum("pfk,fp->k", slopes, off) / (n * (n - 1)))
-
-    @property
-    def sliced(self) -> bool:
-        """Whether it is a slice."""
-        return self.name[-1].isdigit()
 
 
 class Slice:
@@ -249,13 +243,11 @@ class Comparison:
             # relative to pulses of the same rank, with which slices move
             moved = moved - near @ of_quantiles
         difference = quantiles - np.quantile(own, QUANTILES)
-        whole = Difference(f"{by} quantiles", difference, covariance, of_quantiles)
+        whole = Difference(difference, covariance, of_quantiles)
 
         of_data, _ = hats(own, np.quantile(own, RANKS[by]))
-        centres, parts = (
-            np.quantile(every, RANKS[by]),
-            list[tuple[Slice, float, Values, Values]](),
-        )
+        centres = np.quantile(every, RANKS[by])
+        parts = list[tuple[Slice, float, Values, Values]]()
         of_sim, turned = zip(*(hats(value, centres) for value in values), strict=True)
         noise = self.views[0] - self.clean
         rms = np.sqrt(np.mean(noise**2, axis=0, dtype=float))
@@ -278,11 +270,11 @@ class Comparison:
         samples = max(1.0, 0.5 * len(values)) * len(self.sides)
         of_noise *= samples / max(samples - len(of_noise), 0.2 * samples)
         slices = []
-        for k, (here, n_data, difference, slopes) in enumerate(parts):
+        for here, n_data, difference, slopes in parts:
             covariance = (1 - POOLED) * here.shapes + POOLED * shapes
             covariance = covariance * (1 / here.number + 1 / n_data)
             covariance = covariance + of_noise * (1 / n_data + here.left)
-            slices.append(Difference(f"{by} {k}", difference, covariance, slopes))
+            slices.append(Difference(difference, covariance, slopes, sliced=True))
         return whole, slices
 
 
@@ -415,7 +407,7 @@ class Joint:
         values = np.mean(each, axis=0)
         off = values.mean(axis=0) - self.data.mean(axis=0)
         if basis is None:
-            return Difference("joint", off, covariance)
+            return Difference(off, covariance)
         moves: list[Derivatives | Changes] = [Derivatives(basis, self.sides, noisy[0], heights)]
         if changes:
             records = [self.sides.changed(draw, transfer, heights) for draw in changes]
@@ -425,7 +417,7 @@ class Joint:
         parts = np.array_split(np.flatnonzero(single), PARTS)
         slopes = np.array([self._slopes(noisy[0][of], of_each[of], of_log[of]) for of in parts])
         means = np.array([part.mean(axis=0) for part in np.array_split(values, PARTS)])
-        return Difference("joint", off, covariance, slopes.mean(axis=0), (slopes, means))
+        return Difference(off, covariance, slopes.mean(axis=0), (slopes, means))
 
     def covariance(self, of_each: Values) -> Values:
         """Covariance of a difference of means from that of single pulses."""
@@ -444,9 +436,8 @@ class Joint:
     def _shape(self, pulses: Aligned) -> Values:
         """Segments and components in robust standard deviations."""
         views = self.sides.view(pulses.pulses).astype(float) - self.middle
-        return np.asarray(
-            np.clip(views @ self.matrix - self.centre, -self.clipped, self.clipped)
-        )
+        shape: Values = views @ self.matrix - self.centre
+        return shape.clip(-self.clipped, self.clipped)
 
     def _bins(self, pulses: Aligned) -> tuple[Values, Values]:
         """Bins of the amplitude, and their derivatives, shape (pulses, bins)."""

@@ -305,12 +305,10 @@ def _with_amplitude(
     information, right = np.eye(n) / LOOSER, np.zeros(n)
     for sides in bands:
         difference = Joint(sides).difference(transfer, along)
-        whitened = partial(
-            scipy.linalg.solve_triangular, np.linalg.cholesky(difference.covariance), lower=True
-        )
-        slopes = whitened(difference.slopes)
+        root = np.linalg.cholesky(difference.covariance)
+        slopes = scipy.linalg.solve_triangular(root, difference.slopes, lower=True)
         information += slopes.T @ slopes
-        right -= slopes.T @ whitened(difference.values)
+        right -= slopes.T @ scipy.linalg.solve_triangular(root, difference.values, lower=True)
         right += difference.shared
     place = place + modes @ np.linalg.solve(information, right)
     own.set_deviation(knots.between @ place, knots.between @ draws)

@@ -13,8 +13,8 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -60,8 +60,7 @@ Continuum = Callable[[], tuple[InputSet, InputSet]]
 Rows = slice | Samples | npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class EnergyBand:
+class EnergyBand(NamedTuple):
     """Pulses of both sides that are compared with each other.
 
     Parameters
@@ -190,11 +189,13 @@ def spectrum_weights(sim_kev: Values, data_kev: Values) -> Values:
     return np.asarray(weights / max(weights.mean(), 1e-9))
 
 
-@dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise for a set of pulses, the same at each use.
+    """Noise for records of `length` samples of a set of pulses, the same at each use.
 
-    Parameters
+    The two draws of a pair are of opposite sign, so that the contribution of noise to a mean
+    cancels.
+
+    Attributes
     ----------
     traces
         For an energy of 1 keV, shape (traces, samples).
@@ -206,44 +207,32 @@ class Noise:
         a record, shape (samples,); None for none.
     """
 
-    traces: FloatArray
-    trace: npt.NDArray[np.intp]
-    start: npt.NDArray[np.intp]
-    factor: FloatArray
     left: FloatArray | None = None
     decay: FloatArray | None = None
 
-    @classmethod
-    def draw(
-        cls,
+    def __init__(
+        self,
         noise: BaselineNoise,
         energy_kev: Values,
         length: int,
         pairs: int,
         rng: np.random.Generator,
         tails: DrawnTails | None = None,
-    ) -> Noise:
-        """Draw noise for records of `length` samples.
-
-        The two draws of a pair are of opposite sign, so that the contribution of noise to a
-        mean cancels.
-        """
+    ) -> None:
         n = len(energy_kev)
         n_traces = min(NOISE_TRACES, n * pairs)
-        traces = noise.draw(np.ones(n_traces), 2 * length, rng)
+        self.traces = noise.draw(np.ones(n_traces), 2 * length, rng)
         # each trace is used before any is used again
-        trace = np.concatenate(
-            [rng.permutation(n_traces) for _ in range(-(-n * pairs // n_traces))]
-        )
-        trace = np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)
+        rounds = range(-(-n * pairs // n_traces))
+        trace = np.concatenate([rng.permutation(n_traces) for _ in rounds])
+        self.trace = np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)
         sign = rng.choice((-1.0, 1.0), (pairs, n))
-        start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
+        self.start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
         factor = np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev
-        left = decay = None
+        self.factor = np.asarray(factor, np.float32)
         if tails is not None:
-            left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
-            decay = np.asarray(tails.decay(length), np.float32)
-        return cls(traces, trace, start, np.asarray(factor, np.float32), left, decay)
+            self.left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
+            self.decay = np.asarray(tails.decay(length), np.float32)
 
     def add(self, records: FloatArray, draw: int) -> FloatArray:
         """Records of the pulses with the noise of a draw."""
@@ -308,7 +297,7 @@ class Sides:
         name: str,
         rows: Samples,
     ) -> None:
-        self.frame = frame = Frame.of(recipe.matching.training)
+        self.frame = frame = Frame(recipe.matching.training)
         # height of the plateau of a prepared pulse, to which the noise refers
         self.tail_level = recipe.preparation.tail_level
         self.noise, self.energy_kev, self.name, self.rows = noise, sim.energy_kev, name, rows
@@ -383,10 +372,12 @@ class Sides:
         some = copy.copy(self)
         for name in ("sim", "current", "charge", "spectra", "energy_kev", "rows"):
             setattr(some, name, getattr(self, name)[rows])
-        noise, names = self.noise, ("trace", "start", "factor")
-        drawn = {name: np.ascontiguousarray(getattr(noise, name)[:, rows]) for name in names}
-        left = None if noise.left is None else noise.left[:, rows]
-        some.noise = replace(noise, left=left, **drawn)
+        some.noise = copy.copy(self.noise)
+        for name in ("trace", "start", "factor"):
+            of_rows = np.ascontiguousarray(getattr(self.noise, name)[:, rows])
+            setattr(some.noise, name, of_rows)
+        if self.noise.left is not None:
+            some.noise.left = self.noise.left[:, rows]
         return some
 
     def late_rms(self, aligned: Aligned) -> Values:
@@ -477,12 +468,11 @@ class PulseSets:
 
     def __post_init__(self) -> None:
         require_energies(self.sim.energy_kev)
-        self.bands = list[EnergyBand]()
-        for band in energy_bands(self.sim.energy_kev, self.data.energy_kev, self.recipe.peaks):
+        energies, self.bands = (self.sim.energy_kev, self.data.energy_kev), list[EnergyBand]()
+        for name, sim, data, weights in energy_bands(*energies, self.recipe.peaks):
             # in random order, so that any first part is representative
-            sim, data = (self.rng.permutation(len(side)) for side in (band.sim, band.data))
-            shuffled = band.sim[sim], band.data[data], band.weights[sim]
-            self.bands.append(EnergyBand(band.name, *shuffled))
+            order, other = (self.rng.permutation(len(side)) for side in (sim, data))
+            self.bands.append(EnergyBand(name, sim[order], data[other], weights[order]))
         samples = self.recipe.preparation.decay_fit_samples
         lever = np.arange(samples) - 0.5 * (samples - 1)
         tails = self.data.waveforms[spread(len(self.data), DRAWN), -samples:]
@@ -511,7 +501,7 @@ class PulseSets:
             rows = rows[np.searchsorted(share, (np.arange(len(rows)) + 0.5) / len(rows))]
         sim, measured = sim[rows], data.waveforms[band.data[:MOST]]
         length, pairs = record_length(sim.length, sim.dt_ns), max(1, round(NOISES / len(sim)))
-        noise = Noise.draw(self.noise, sim.energy_kev, length, pairs, self.rng, self.tails)
+        noise = Noise(self.noise, sim.energy_kev, length, pairs, self.rng, self.tails)
         finite = np.isfinite(measured).all(axis=1)
         return Sides(sim, measured[finite], noise, self.recipe, band.name, rows)
 

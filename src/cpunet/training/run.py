@@ -47,10 +47,6 @@ if TYPE_CHECKING:
     from pandas import DataFrame
     from torch import nn
 
-    from cpunet.pulses.channels import Outcome
-    from cpunet.translation.translation import Translation
-    from cpunet.translation.translator import IREN, REN
-    from cpunet.validation.report import Report
 
 log = logging.getLogger(__name__)
 
@@ -261,32 +257,6 @@ class Run(InfoPart):
         return DataFrame([row | row.pop("losses") for row in rows])  # type: ignore[operator]
 
     @cached_property
-    def ren(self) -> REN:
-        """Translator from simulated to measured-like pulses."""
-        from cpunet.translation.translator import REN
-
-        return REN.of(self)
-
-    @cached_property
-    def iren(self) -> IREN:
-        """Translator from measured to simulation-like pulses."""
-        from cpunet.translation.translator import IREN
-
-        return IREN.of(self)
-
-    @cached_property
-    def covariance(self) -> DataFrame:
-        """Covariance of the fitted parameters, with their names; empty if nothing was fitted.
-
-        Parameters of positive quantities are their logarithms (``log_poles_ns.0``).
-        """
-        from pandas import DataFrame
-
-        fit = self.fit or FitInfo()
-        names = list(fit.errors) if fit.covariance else []
-        return DataFrame(np.array(fit.covariance).reshape(-1, len(names)), names, names)
-
-    @cached_property
     def parameters(self) -> dict[str, float]:
         """Physical parameters of the readout chain; each name ends with the unit.
 
@@ -314,22 +284,6 @@ class Run(InfoPart):
         if self.recipe.generator.name != "response":
             return loss_curves(self.records)
         return Response([describe_chain(self)]).plot()
-
-    def translate(
-        self, pulses: Any, out: str | Path | None = None, **how: Any
-    ) -> Translation | Outcome[Translation]:
-        """Translate with this run, see `cpunet.translate`."""
-        from cpunet.translation.translate import translate
-
-        return translate(self, pulses, out, **how)
-
-    def validate(  # type: ignore[override]  # pydantic's own is deprecated
-        self, sim: Any, data: Any, out: str | Path | None = None, **how: Any
-    ) -> Report | Outcome[Report]:
-        """Validate this run, see `cpunet.validate`."""
-        from cpunet.validation.validate import validate
-
-        return validate(self, sim, data, out, **how)
 
     @property
     def ok(self) -> bool:
