@@ -156,7 +156,6 @@ WRONG = {
     "fast": [
         ("training.method=cyclegan", "training"),
         ("training.start_factors=[a, 1]", "training.start_factors.0: "),
-        ("generator.slow_ns=[100, 100.0]", "times must differ"),
         ("training.level_ns=9000", "level_ns must be less than after_ns"),
         ("preparation.align_at=0.999", "align_at must be half_height"),
         ("generator.poles_ns=[40, -1]", "generator.poles_ns.1: "),

@@ -10,19 +10,13 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, NamedTuple, Self
 
-from pydantic import AfterValidator, Field, PrivateAttr, field_validator, model_validator
+from pydantic import Field, PrivateAttr, model_validator
 
 from cpunet.errors import CpunetError
 from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples, Width
 
 # parameters that stretch the simulated drift, see `cpunet.networks.response_layer`
 DriftTerms = Annotated[int, Field(ge=0, le=2)]
-
-
-def _rising(ends: tuple[float, float]) -> tuple[float, float]:
-    if not ends[0] < ends[1]:
-        raise ValueError("must go from a lower to a higher value")
-    return ends
 
 
 class Timed(Config):
@@ -46,9 +40,6 @@ class Timed(Config):
     def samples(self, time_ns: float) -> int:
         """Number of samples of a time in ns."""
         return round(time_ns / self.sampled_ns)
-
-
-_RangeKev = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
 
 
 class PunetConfig(Config):
@@ -86,13 +77,6 @@ class ResponseConfig(Config):
     deviations: bool
     by_height: bool
 
-    @field_validator("slow_ns", "fast_decays_us")
-    @classmethod
-    def _times_differ(cls, times: tuple[float, ...]) -> tuple[float, ...]:
-        if len({*times}) < len(times):
-            raise ValueError("times must differ")
-        return times
-
 
 class GruConfig(Config):
     """The GRU discriminator with attention (paper, section 2.2.2).
@@ -111,7 +95,7 @@ class GruConfig(Config):
     embedding_dim: Width
     hidden: Width
     samples_per_step: Samples
-    value_range: Annotated[tuple[float, float], AfterValidator(_rising)] | None
+    value_range: tuple[float, float] | None
     view: Literal["window", "spread"]
     components: Samples
     batch_norm: bool
@@ -175,11 +159,6 @@ class PreparationConfig(Timed):
     def length(self) -> int:
         """Samples of a prepared pulse."""
         return self.samples_before + self.samples_after
-
-    @property
-    def align_fraction(self) -> float:
-        """Fraction of the height at which pulses are aligned."""
-        return 0.5 if self.align_at == "half_height" else self.align_at
 
     @property
     def baseline_samples(self) -> int:
@@ -318,8 +297,8 @@ class ScoreConfig(Timed):
     bootstraps: Annotated[int, Field(ge=2, le=100_000)]
     drift_start_fraction: Annotated[float, Field(gt=0, lt=1)]
     edge_ns: Positive
-    sideband_kev: _RangeKev
-    continuum_kev: dict[str, _RangeKev]
+    sideband_kev: tuple[Positive, Positive]
+    continuum_kev: dict[str, tuple[Positive, Positive]]
 
 
 Critics = Annotated[GruConfig | ConvolutionalConfig, Field(discriminator="name")]
