@@ -52,7 +52,7 @@ def rings() -> Unpaired:
 def deviating(response: ElectronicsResponse, deviation: np.ndarray) -> ElectronicsResponse:
     own = ElectronicsResponse(response.config.model_copy(update={"deviations": True}), DT_NS)
     own.fill(own.arrays() | response.arrays())
-    own.set_deviation(deviation)
+    own.deviation[:] = deviation
     return own
 
 

@@ -249,7 +249,7 @@ class JointProblem:
         self.chain.set(vector[:own])
         self.along = vector[own:n].copy()
         if len(self.along):
-            self.response.set_deviation(self.modes @ self.along)
+            self.response.deviation[:] = self.modes @ self.along
         self.coordinates = self.coordinates.copy()
         self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
 

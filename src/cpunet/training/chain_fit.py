@@ -23,6 +23,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.fft
+import scipy.linalg
 
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
@@ -298,7 +299,10 @@ def fit_chain(
             chi_square, functions = 0.0, 0
             for comparison in compared:
                 difference = differences(parameters, comparison)
-                values, slopes = difference.white
+                root = np.linalg.cholesky(difference.covariance)
+                both = np.column_stack([difference.values, difference.slopes])
+                white = scipy.linalg.solve_triangular(root, both, lower=True)
+                values, slopes = white[:, 0], white[:, 1:]
                 information += slopes.T @ slopes
                 gradient += slopes.T @ values - difference.shared
                 chi_square += float(values @ values)

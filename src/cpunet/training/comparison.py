@@ -93,14 +93,6 @@ class Difference:
         return float(self.values @ solved) / len(self.values)
 
     @property
-    def white(self) -> tuple[Values, Values]:
-        """Uncorrelated differences of unit variance, and their derivatives."""
-        root = np.linalg.cholesky(self.covariance)
-        both = np.column_stack([self.values, self.slopes])
-        white = scipy.linalg.solve_triangular(root, both, lower=True)
-        return white[:, 0], white[:, 1:]
-
-    @property
     def shared(self) -> Values:
         """What :math:`J^T C^{-1} d` is on average where both sides agree, (coordinates,).
 

@@ -241,7 +241,7 @@ def with_deviations(
         problem = Linearised(some, partial(Derivatives, knots.between), width)
         before, far, halved = (np.inf, place), True, 0
         for _ in range(STEPS):
-            own.set_deviation(knots.between @ place)
+            own.deviation[:] = knots.between @ place
             cost = problem.evaluate(own.transfer(padded), place, anew=far)
             count(cost)
             if not cost <= 1.02 * before[0] + 5:  # worse, or no number
@@ -267,14 +267,14 @@ def with_deviations(
                 break
     if not begun:
         return response, NONE
-    own.set_deviation(knots.between @ place)
+    own.deviation[:] = knots.between @ place
     cost = problem.evaluate(own.transfer(padded), place, anew=False)
     if not cost <= before[0]:
         cost, place = before
     alone = problem.evaluate(response.transfer(padded), 0 * place, anew=False)
     if not cost < alone:
         return response, NONE
-    own.set_deviation(knots.between @ place)
+    own.deviation[:] = knots.between @ place
     both = information, problem.information
     return own, _with_amplitude(own, bands, knots, place, both, covariance)
 
@@ -311,7 +311,8 @@ def _with_amplitude(
         right -= slopes.T @ scipy.linalg.solve_triangular(root, difference.values, lower=True)
         right += difference.shared
     place = place + modes @ np.linalg.solve(information, right)
-    own.set_deviation(knots.between @ place, knots.between @ draws)
+    own.deviation[:] = knots.between @ place
+    own.deviation_draws[:] = (knots.between @ draws).T
     sizes, axes = np.linalg.eigh(root.T @ informations[1] @ root)
     return np.asarray(knots.between @ (root @ axes[:, sizes > 1]))
 

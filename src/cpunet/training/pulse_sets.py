@@ -109,50 +109,40 @@ def energy_bands(
     >>> [(b.name, len(b.sim), len(b.data)) for b in energy_bands(sim, data, lines)]
     [('FEP', 500, 400), ('1000-1200 keV', 900, 800)]
     """
-    labels = [label_peaks(side, peaks) for side in (sim_kev, data_kev)]
-    bands = []
+    bands, energies = list[EnergyBand](), (sim_kev, data_kev)
+    labels = [label_peaks(side, peaks) for side in energies]
     for name in peaks:
         sim, data = (np.flatnonzero(of == name) for of in labels)
         if min(len(sim), len(data)) >= MIN_PULSES:
             bands.append(EnergyBand(name, sim, data, np.ones(len(sim))))
-    inside = {band.name for band in bands}
-    sim, data = (np.flatnonzero(~np.isin(of, [*inside])) for of in labels)
+    # pulses that are not in a line, from the highest energy down
+    inside = [band.name for band in bands]
+    others = [np.flatnonzero(~np.isin(of, inside)) for of in labels]
     for widest in WIDEST:
-        bands += _continuum(sim_kev, data_kev, sim, data, widest)
+        rows = [r[np.argsort(-e[r])] for r, e in zip(others, energies, strict=True)]
+        while min(map(len, rows)):
+            top = min(e[r[0]] for r, e in zip(rows, energies, strict=True))
+            rows = [r[e[r] <= top] for r, e in zip(rows, energies, strict=True)]
+            both = zip(rows, energies, strict=True)
+            counts = [int((e[r] >= top / widest).sum()) for r, e in both]
+            left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
+            enough = min(counts) >= MIN_PULSES
+            if enough and min(left) < MIN_PULSES and max(left) < 2 * MIN_PULSES:
+                counts = [len(r) for r in rows]  # include a small remainder
+            if enough:
+                sim, data = (np.sort(r[:n]) for r, n in zip(rows, counts, strict=True))
+                weights = spectrum_weights(sim_kev[sim], data_kev[data])
+                if weights.any():
+                    name = f"{min(sim_kev[sim].min(), data_kev[data].min()):.0f}-{top:.0f} keV"
+                    bands.append(EnergyBand(name, sim, data, weights))
+            rows = [r[max(n, 1) :] for r, n in zip(rows, counts, strict=True)]
         if bands:
-            break
-    else:
-        raise CpunetError(
-            f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {MIN_PULSES} of "
-            "each at the same energies are needed: select more energies (`peak`), simulate "
-            "more, or give more files"
-        )
-    return bands
-
-
-def _continuum(
-    sim_kev: Values, data_kev: Values, sim: Samples, data: Samples, widest: float
-) -> list[EnergyBand]:
-    """Bands of the pulses that are not in a line, from the highest energy down."""
-    bands, energies = [], (sim_kev, data_kev)
-    rows = [side[np.argsort(-e[side])] for side, e in zip((sim, data), energies, strict=True)]
-    while min(map(len, rows)):
-        top = min(e[r[0]] for r, e in zip(rows, energies, strict=True))
-        rows = [r[e[r] <= top] for r, e in zip(rows, energies, strict=True)]
-        inside = (e[r] >= top / widest for r, e in zip(rows, energies, strict=True))
-        counts = [int(of.sum()) for of in inside]
-        left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
-        if min(counts) >= MIN_PULSES and min(left) < MIN_PULSES and max(left) < 2 * MIN_PULSES:
-            counts = [len(r) for r in rows]  # include a small remainder
-        parts = [np.sort(r[:n]) for r, n in zip(rows, counts, strict=True)]
-        if min(counts) >= MIN_PULSES:
-            low = min(e[r].min() for r, e in zip(parts, energies, strict=True))
-            weights = spectrum_weights(sim_kev[parts[0]], data_kev[parts[1]])
-            if weights.any():
-                name = f"{low:.0f}-{top:.0f} keV"
-                bands.append(EnergyBand(name, parts[0], parts[1], weights))
-        rows = [r[max(n, 1) :] for r, n in zip(rows, counts, strict=True)]
-    return bands
+            return bands
+    raise CpunetError(
+        f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {MIN_PULSES} of "
+        "each at the same energies are needed: select more energies (`peak`), simulate "
+        "more, or give more files"
+    )
 
 
 def continuum(recipe: Recipe) -> EnergySelection:
