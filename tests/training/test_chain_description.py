@@ -30,7 +30,6 @@ from synthetic import (
     NOISE_SAMPLES,
     load_recipe,
     one_line,
-    status_of,
     write_chain,
     write_run,
 )
@@ -197,6 +196,13 @@ def test_the_truth_of_a_stand(run, tmp_path):
     (stand / "stand.json").write_text(json.dumps(content))
     known = response(run, truth=electronics()).true_values
     assert response(run, truth=stand).true_values == known
+    chain = tmp_path / "chain.yaml"
+    chain.write_text(yaml.safe_dump(content["electronics"]))
+    of_two = response(run, write_response(tmp_path / "run [2]", fit=FIT), truth=chain)
+    assert of_two.true_values == known
+    head, line, *_ = str(of_two).splitlines()[1:]
+    assert head.split()[-4:] == ["run", "run", "[2]", "known"]
+    assert line.split() == ["bandwidth", "pole", "1", "[ns]", "55", "60", "55"]
     assert response(Run.load(run), truth="legend200").truth.name == "legend200"
     (stand / "stand.json").unlink()
     one_line(lambda: response(run, truth=stand), "stand.json: cannot be read")
@@ -227,21 +233,6 @@ def test_runs_that_cannot_be_described(run, tmp_path):
     (network := tmp_path / "network").mkdir()
     write_run(network, {}, load_recipe("published"), FACTS)
     refused(network, parts=(f"{network}: recipe published trains a network", "cpunet validate"))
-
-
-def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, capsys):
-    chain = tmp_path / "chain.yaml"
-    chain.write_text(yaml.safe_dump(electronics().model_dump(mode="json")))
-    runs = [run.rename(tmp_path / "a run of a long name [1]")]
-    runs += [write_response(tmp_path / f"another run, {i}", fit=FIT) for i in range(4)]
-    assert status_of("response", *runs, "--truth", chain) == 0
-    printed = capsys.readouterr().out
-    for text in ("a run of a long name [1]", "another run, 3", "known"):
-        assert text in printed
-    line = next(line for line in printed.splitlines() if "bandwidth pole 1" in line)
-    assert line.split()[:9] == ["bandwidth", "pole", "1", "[ns]", "55", *["60"] * 4]
-    assert "late charge [%]" in printed
-    assert "…" not in printed
 
 
 def test_a_poor_fit_is_doubted(run, tmp_path):
