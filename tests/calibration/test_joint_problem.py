@@ -23,7 +23,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.chain_fit import Fitter, fit_chain, with_decay, with_settings
-from cpunet.training.comparison import SHRUNK
+from cpunet.training.joint import SHRUNK
 from cpunet.training.pulse_sets import PulseSets
 from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, charge, coarse, faster, measured_with

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.training import pulse_sets
-from cpunet.training.pulse_sets import HEAVIEST, MIN_PULSES, WIDEST, EnergyBand, energy_bands
+from cpunet.training import energy_bands as module
+from cpunet.training.energy_bands import HEAVIEST, MIN_PULSES, WIDEST, EnergyBand, energy_bands
 from synthetic import load_recipe
 
 PEAKS = load_recipe("fast").peaks
@@ -61,7 +61,7 @@ def test_no_pulse_is_in_two_bands_and_none_is_far_from_its_own(
     while not bands and tried < len(WIDEST):  # wide ones only where there is no narrower one
         widest, tried = WIDEST[tried], tried + 1
         with pytest.MonkeyPatch.context() as patch, suppress(CpunetError):
-            patch.setattr(pulse_sets, "WIDEST", (widest,))
+            patch.setattr(module, "WIDEST", (widest,))
             bands = energy_bands(sim, data, {})
     if not bands:  # the highest ones have no counterpart
         assert min(len(sim), len(data)) < 1.5 * MIN_PULSES

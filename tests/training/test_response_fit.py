@@ -25,7 +25,8 @@ from cpunet.training.chain_fit import (
     fit_chain,
     with_decay,
 )
-from cpunet.training.comparison import SEGMENTS, Difference, Joint, SingleSites
+from cpunet.training.comparison import Difference
+from cpunet.training.joint import SEGMENTS, Joint, SingleSites
 from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.response_fit import fit_response
 from cpunet.training.verdict import FitInfo, amplitude_shift

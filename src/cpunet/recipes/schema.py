@@ -10,13 +10,19 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, NamedTuple, Self
 
-from pydantic import Field, PrivateAttr, model_validator
+from pydantic import AfterValidator, Field, PrivateAttr, model_validator
 
 from cpunet.errors import CpunetError
 from cpunet.settings import Config, Count, Fraction, NonNegative, Positive, Samples, Width
 
 # parameters that stretch the simulated drift, see `cpunet.networks.response_layer`
 DriftTerms = Annotated[int, Field(ge=0, le=2)]
+
+
+def _rising(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
+        raise ValueError("must go from a lower to a higher value")
+    return ends
 
 
 class Timed(Config):
@@ -40,6 +46,9 @@ class Timed(Config):
     def samples(self, time_ns: float) -> int:
         """Number of samples of a time in ns."""
         return round(time_ns / self.sampled_ns)
+
+
+_RangeKev = Annotated[tuple[Positive, Positive], AfterValidator(_rising)]
 
 
 class PunetConfig(Config):
@@ -95,7 +104,7 @@ class GruConfig(Config):
     embedding_dim: Width
     hidden: Width
     samples_per_step: Samples
-    value_range: tuple[float, float] | None
+    value_range: Annotated[tuple[float, float], AfterValidator(_rising)] | None
     view: Literal["window", "spread"]
     components: Samples
     batch_norm: bool
@@ -297,8 +306,8 @@ class ScoreConfig(Timed):
     bootstraps: Annotated[int, Field(ge=2, le=100_000)]
     drift_start_fraction: Annotated[float, Field(gt=0, lt=1)]
     edge_ns: Positive
-    sideband_kev: tuple[Positive, Positive]
-    continuum_kev: dict[str, tuple[Positive, Positive]]
+    sideband_kev: _RangeKev
+    continuum_kev: dict[str, _RangeKev]
 
 
 Critics = Annotated[GruConfig | ConvolutionalConfig, Field(discriminator="name")]

@@ -1,6 +1,6 @@
 r"""The parameters of a chain, fitted to unpaired pulses by Gauss and Newton.
 
-The differences :math:`d` of `cpunet.training.comparison` are nearly linear in the coordinates
+The differences :math:`d` of `cpunet.training.joint` are nearly linear in the coordinates
 :math:`x` of `SmoothParameters`.  With their covariance :math:`C`, derivatives
 :math:`J`, and a prior :math:`x_0` of covariance :math:`P`, a step is
 
@@ -30,7 +30,8 @@ from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.aligned import Values
-from cpunet.training.comparison import Comparison, Difference, Joint, SingleSites
+from cpunet.training.comparison import Comparison, Difference
+from cpunet.training.joint import Joint, SingleSites
 from cpunet.training.pulse_sets import Sides
 
 POLES, DECAY, DECAY_WEIGHTS = "log_poles_ns", "log_decay_us", "decay_weights"

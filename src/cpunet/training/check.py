@@ -36,7 +36,8 @@ from cpunet.pulses.preparation import Kind, Rejection
 from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
-from cpunet.training.pulse_sets import MIN_PULSES, spread
+from cpunet.training.energy_bands import MIN_PULSES
+from cpunet.training.pulse_sets import spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

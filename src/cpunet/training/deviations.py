@@ -33,7 +33,8 @@ from scipy.special import expit
 from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, Spectrum, deviation_lags
 from cpunet.training.aligned import Derivatives, Values
 from cpunet.training.chain_fit import SmoothParameters, with_settings
-from cpunet.training.comparison import NONE, Comparison, Joint, Moved
+from cpunet.training.comparison import NONE, Comparison, Moved
+from cpunet.training.joint import Joint
 from cpunet.training.pulse_sets import MOST, Sides
 
 # Knots in ns: the last of the dense ones and of all, and their spacing.

@@ -20,7 +20,7 @@ from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.aligned import Values
-from cpunet.training.pulse_sets import MIN_PULSES
+from cpunet.training.energy_bands import MIN_PULSES
 
 # RMS, in pulse heights, of white noise added to that of the baselines: rounding to float32,
 # and effects that the response does not describe.
