@@ -30,6 +30,7 @@ from cpunet.training.network_runs import settle
 from cpunet.training.views import RECENT, SHARP, Judge, View, aligned
 from games import as_published, game_of, mended, windows
 from synthetic import LOSS_NAMES, interrupted_in, load_recipe
+from synthetic import same_random_numbers as same_random_numbers
 
 pytestmark = pytest.mark.usefixtures("same_random_numbers")
 

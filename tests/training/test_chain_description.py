@@ -217,38 +217,29 @@ def test_every_parameter_has_a_row():
 
 
 def test_runs_that_cannot_be_described(run, tmp_path):
-    out = tmp_path / "out"
-
-    def refused(*runs: Path, parts: tuple[str, ...], truth: Electronics | None = None) -> None:
-        one_line(lambda: response(*runs, truth=truth, out=out), *parts)
-        assert not out.exists()
-
-    refused(tmp_path / "none", parts=("none: no finished run", "cpunet train"))
-    refused(run, tmp_path / "none", parts=("none: no finished run",))
-    refused(parts=("no run was given",))
-    coarse = write_response(tmp_path / "coarse", dt_ns=10.0)
-    refused(coarse, truth=electronics(), parts=(f"{coarse}: ", "electronics known samples"))
-    (coarse / "weights.safetensors").write_bytes(b"")
-    refused(coarse, parts=("weights.safetensors: no readable weights",))
-    (network := tmp_path / "network").mkdir()
+    out, network = tmp_path / "out", tmp_path / "network"
+    coarse, truth = write_response(tmp_path / "coarse", dt_ns=10.0), electronics()
+    network.mkdir()
     write_run(network, {}, load_recipe("published"), FACTS)
-    refused(network, parts=(f"{network}: recipe published trains a network", "cpunet validate"))
+    for runs, parts in (
+        ((run, tmp_path / "none"), ("none: no finished run", "cpunet train")),
+        ((), ("no run was given",)),
+        ((coarse,), (f"{coarse}: ", "electronics known samples")),
+        ((network,), (f"{network}: recipe published trains a network", "cpunet validate")),
+    ):
+        one_line(lambda runs=runs: response(*runs, truth=truth, out=out), *parts)
+        assert not out.exists()
 
 
 def test_a_poor_fit_is_doubted(run, tmp_path):
-    info = json.loads((run / "run.json").read_text())
-
-    def doubts(fit: object) -> list[str]:
-        (run / "run.json").write_text(json.dumps(info | {"fit": fit}))
-        return response(run).runs[0].doubts
-
-    assert doubts(FIT) == []
+    assert response(run).runs[0].doubts == []
     checks = {"chi_square": 9.0, "amplitude": 1.0, "z": 30.0, "z_ns": 40.0}
     checks |= {"beyond_ns": [40.0, 48.0], "off": {"onset": 30.0}, "pulses": [1000, 900]}
-    (said,) = doubts(FIT | {"verdict": "bad: chi-square is 9", "checks": checks})
+    fit = FIT | {"verdict": "bad: chi-square is 9", "checks": checks}
+    (said,) = response(write_response(tmp_path / "bad", fit=fit)).runs[0].doubts
     assert said.startswith("the fit is bad: chi-square is 9; ")
     assert said.endswith(PARTS["onset"][1])
-    assert doubts(None) == doubts({}) == []
+    assert response(write_response(tmp_path / "none")).runs[0].doubts == []
     early = write_response(tmp_path / "early", slow={0: -0.4, 2: -0.2})
     (said,) = response(early).runs[0].doubts
     assert said.startswith("60 % of the charge would arrive too early")
