@@ -306,10 +306,10 @@ def _with_amplitude(
     information, right = np.eye(n) / LOOSER, np.zeros(n)
     for sides in bands:
         difference = Joint(sides).difference(transfer, along)
-        root = np.linalg.cholesky(difference.covariance)
-        slopes = scipy.linalg.solve_triangular(root, difference.slopes, lower=True)
+        factor = np.linalg.cholesky(difference.covariance)
+        slopes = scipy.linalg.solve_triangular(factor, difference.slopes, lower=True)
         information += slopes.T @ slopes
-        right -= slopes.T @ scipy.linalg.solve_triangular(root, difference.values, lower=True)
+        right -= slopes.T @ scipy.linalg.solve_triangular(factor, difference.values, lower=True)
         right += difference.shared
     place = place + modes @ np.linalg.solve(information, right)
     own.deviation[:] = knots.between @ place
