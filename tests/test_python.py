@@ -94,7 +94,8 @@ def test_a_run(home, run):
     assert run.folder == home / "run"
     assert (run.seed, run.dt_ns) == (2, 16)
     assert run.fit.chi_square_per_moment > 0
-    assert list(run.losses) == ["iteration", "rate", "chi_square"]
+    losses = pandas.json_normalize(run.records)
+    assert list(losses) == ["iteration", "rate", "losses.chi_square"]
     assert run.parameters["decay_us"] > 0
     again = cpunet.Run.load(str(run.folder))
     assert again.model_dump() == run.model_dump()

@@ -44,7 +44,6 @@ from cpunet.training.verdict import FitInfo
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-    from pandas import DataFrame
     from torch import nn
 
 
@@ -247,14 +246,6 @@ class Run(InfoPart):
             return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
         except ValueError as error:
             raise CpunetError(f"{path}: damaged ({error}); remove it or train again") from error
-
-    @cached_property
-    def losses(self) -> DataFrame:
-        """Losses of the training: a row per record, with ``iteration`` and ``rate``."""
-        from pandas import DataFrame
-
-        rows = [dict(record) for record in self.records]
-        return DataFrame([row | row.pop("losses") for row in rows])  # type: ignore[operator]
 
     @cached_property
     def parameters(self) -> dict[str, float]:
