@@ -94,8 +94,9 @@ def of_late_pulses(folder: Path, first: int) -> PulseFile:
     pulses = np.exp(-np.maximum(time, 0) / 4000) / (1 + np.exp(-np.clip(time, -50, 50)))
     raw = 1000 + 10 * KEV[0] * pulses + rng.normal(0, 20, pulses.shape)
     whole = Pulses.of(raw, dt_ns=16.0, energy_kev=np.full(n, KEV[0]))
-    write_pulses(folder / "late.lh5", whole, table="geds/raw", waveform_units="ADC")
-    return PulseFile(folder / "late.lh5")
+    file = folder / f"{first}.lh5"
+    write_pulses(file, whole, table="geds/raw", waveform_units="ADC")
+    return PulseFile(file)
 
 
 def test_windows_end_where_traces_do(tmp_path, caplog):
@@ -108,16 +109,17 @@ def test_windows_end_where_traces_do(tmp_path, caplog):
         selection = parse_selection("FEP", chosen.peaks)
         same = load_pulses(late, "measured", chosen, selection, shorten=True)
         assert same.recipe is chosen
-    recipe, file = load_recipe("fast"), of_late_pulses(tmp_path, 560)
+    recipe, file = load_recipe("fast"), PulseFile(tmp_path / "560.lh5")
     as_chosen = load_pulses(file, "measured", recipe, selection)
     assert as_chosen.prepared.rejections["pulse_at_edge"] == pytest.approx(80, abs=3)
+    caplog.clear()
     with caplog.at_level("WARNING", "cpunet"):
         whole = load_pulses(file, "measured", recipe, selection, shorten=True)
     assert "pulse_at_edge" not in whole.prepared.rejections
     windows, training = whole.recipe.preparation, whole.recipe.training
     assert windows.after_ns == training.after_ns == 6400 - 320
     assert whole.prepared.pulses.length == 800 - 20
-    assert caplog.messages[-1] == (
-        "late.lh5: 32 % of the traces end before their windows would; "
+    assert caplog.messages == [
+        "560.lh5: 32 % of the traces end before their windows would; "
         "these end 6080 ns after the alignment, not 6400 ns"
-    )
+    ]
