@@ -206,8 +206,8 @@ def test_what_is_wrong_is_one_line(home, run):
     (damaged / "calibration.json").write_text("[1]")
     for words, call, *given in (
         ("ndarray: are no pulses; give a path", cpunet.train, nothing, sides[1], new),
-        ("memory holds no pulses", run.translate, Pulses.of(nothing[:0], dt_ns=16)),
-        (r"none of 3 pulses can .* \(3 ", run.translate, Pulses.of(nothing, dt_ns=16)),
+        ("memory holds no pulses", cpunet.translate, run, Pulses.of(nothing[:0], dt_ns=16)),
+        (r"none of 3 pulses can .* \(3 ", cpunet.translate, run, Pulses.of(nothing, dt_ns=16)),
         ("give the folder of a report", cpunet.Report.load, run.folder),
         ("no calibrated run", cpunet.Calibration.load, run.folder),
         (r"calibration.json: damaged \(no mapping\)", cpunet.Calibration.load, damaged),
