@@ -89,7 +89,7 @@ def faster(fine: Pulses, factor: float) -> Pulses:
 
 def edge_errors(response: ElectronicsResponse) -> np.ndarray:
     """RMSE on the edge of other pulses than were fitted, against those of the true chain."""
-    fine, frame = charge(200, seed=9), Frame.of(RECIPE.matching.training)
+    fine, frame = charge(200, seed=9), Frame(RECIPE.matching.training)
     found, truth = (
         read(np.asarray(records, float), frame).pulses
         for records in (response(simulated(fine).waveforms), linear_response(fine, CHAIN))

@@ -22,7 +22,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hits import Hits
 from cpunet.simulation.settings import SimulationSettings
 from cpunet.training.chain_fit import Fitter, fit_chain, with_decay, with_settings
-from cpunet.training.comparison import SHRUNK
+from cpunet.training.joint import SHRUNK
 from cpunet.training.pulse_sets import PulseSets
 from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, charge, coarse, faster, measured_with
@@ -168,7 +168,7 @@ def test_deviations_of_the_readout_are_free_with_the_physics(problem, fitted):
     places = np.array([100.0, 400.0])
     modes = 1e-3 * np.exp(-0.5 * ((time_ns[:, np.newaxis] - places) / 60) ** 2)
     other = with_settings(fitted, deviations=True)
-    other.set_deviation(modes @ np.array([2.0, -1.0]))
+    other.deviation[:] = modes @ np.array([2.0, -1.0])
     both = problem(response=other, modes=modes)
     n = both.n_chain
     assert both.vector()[n - 2 : n] == pytest.approx([2.0, -1.0])

@@ -66,13 +66,6 @@ def test_noise_of_baselines_has_passed_the_curve() -> None:
         assert behind.std() == pytest.approx(slope * noise.std(), rel=0.01)
 
 
-def test_energies_decide_what_an_amplifier_does() -> None:
-    records = edges(3, seed=2)
-    low, high = (slewing()(records, np.full(3, kev)) for kev in (200.0, KEV))
-    np.testing.assert_allclose(low, records, atol=0.01)
-    assert np.abs(high - records).max() > 0.02
-
-
 def test_noise_passes_the_amplifier_with_the_pulse() -> None:
     config, pulses = load_recipe("fast").at(16.0).preparation, edges(4, seed=3)
     kev = np.full(4, KEV)
@@ -82,29 +75,17 @@ def test_noise_passes_the_amplifier_with_the_pulse() -> None:
     np.testing.assert_array_equal(found.windows, alone.windows)
 
 
-@pytest.fixture
-def run(tmp_path: Path) -> Path:
-    fill = lambda chain: chain.response.by_height.fill(slewing().arrays())  # noqa: E731
-    return write_chain(tmp_path, "generator.by_height=true", change=fill)
-
-
-def test_a_run_stores_what_acts_by_height_and_asks_for_energies(run: Path) -> None:
-    ren, pulses = REN.load(run), edges(4, seed=4)
-    with pytest.raises(CpunetError, match="energy_kev"):
-        ren.translate(pulses, noise=False)
-    low, high = (ren.translate(pulses, energy_kev=kev, noise=False) for kev in (200.0, KEV))
-    assert np.abs(np.diff(low)).max() > 1.05 * np.abs(np.diff(high)).max()
-
-
-def test_raw_traces_have_what_acts_by_height(
-    run: Path, tmp_path_factory: pytest.TempPathFactory
-) -> None:
+def test_a_run_stores_what_acts_by_height_and_raw_traces_have_it(tmp_path: Path) -> None:
     """The largest step of a high pulse is limited, that of a low one is not."""
-    kev = np.repeat([200.0, KEV], 4)
-    pulses = Pulses.of(np.tile(edges(4, seed=4), (2, 1)), dt_ns=16.0, energy_kev=kev)
-    folder = tmp_path_factory.mktemp("files")
-    source, out = folder / "sim.lh5", folder / "out.lh5"
-    write_pulses(source, pulses)
+    fill = lambda chain: chain.response.by_height.fill(slewing().arrays())  # noqa: E731
+    run = write_chain(tmp_path / "run", "generator.by_height=true", change=fill)
+    ren, charge = REN.load(run), edges(4, seed=4)
+    with pytest.raises(CpunetError, match="energy_kev"):
+        ren.translate(charge, noise=False)
+    low, high = (ren.translate(charge, energy_kev=kev, noise=False) for kev in (200.0, KEV))
+    assert np.abs(np.diff(low)).max() > 1.05 * np.abs(np.diff(high)).max()
+    source, out, kev = tmp_path / "sim.lh5", tmp_path / "out.lh5", np.repeat([200.0, KEV], 4)
+    write_pulses(source, Pulses.of(np.tile(charge, (2, 1)), dt_ns=16.0, energy_kev=kev))
     scale = Adc(adc_per_kev=8.0, baseline=1000.0)
     translate(run, source, out, adc=True, scale=scale, noise=False)
     traces = open_pulses(out).read().waveforms.astype(float)

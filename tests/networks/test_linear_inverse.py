@@ -6,7 +6,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.networks import generators
-from cpunet.networks.generators import LinearInverse, stretch
+from cpunet.networks.generators import LinearInverse
 from synthetic import load_recipe
 
 # of 12, 20, 12 to 8, and 8 samples
@@ -33,9 +33,3 @@ def test_it_gives_back_what_it_gets_about_the_half_maximum_and_0_and_1_beyond(mo
     assert result.dtype == np.float32
     assert np.isnan(result[1]).any()
     np.testing.assert_allclose(result[[0, 2]], edges(25, 33), atol=1e-5, rtol=1e-5)
-
-
-def test_a_stretch_goes_on_with_the_edge_values():
-    pulses = np.array([[1.0, 2, 3], [4, 5, 6]])
-    result = stretch(pulses, np.array([0, 2]), -2, 2)
-    assert result.tolist() == [[1, 1, 1, 2], [4, 5, 6, 6]]

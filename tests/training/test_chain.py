@@ -8,17 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cpunet.electronics.drawn_pile_up import TailsLaw
 from cpunet.errors import CpunetError
-from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.run import Run
 from cpunet.training.train import train
-from cpunet.translation.translator import REN
-from synthetic import Files, load_recipe, one_line, write_line, write_pulses
+from synthetic import Files, load_recipe, one_line, write_line
 
 DT_NS, N = 16.0, 420
 # of `write_line`: 4000 samples, 20 of 26000 ADC
-POLE_NS, DECAY_US, NOISE_KEV, ADC_PER_KEV = 70.0, 64.0, 2.01, 9.944
+POLE_NS, DECAY_US, NOISE_KEV = 70.0, 64.0, 2.01
 PREPARED = 0.8 / np.exp(-400 * DT_NS * 1e-3 / DECAY_US)  # height of a prepared pulse
 ONE_POLE = "generator.poles_ns=[50]", "generator.slow_ns=[]", "generator.fast_decays_us=[]"
 ONE_START = "training.start_factors=[1]", "training.steps=14"
@@ -69,30 +66,3 @@ def test_noise_needs_baselines(tmp_path: Path) -> None:
     recipe = load_recipe("published", tiny)
     parts = ("2.lh5: no baselines to draw noise from", "training.noise=none")
     one_line(lambda: train(*few, tmp_path / "run", recipe=recipe, device="cpu"), *parts)
-
-
-@pytest.mark.thorough
-def test_tails_of_earlier_pulses_are_learned_without_being_asked(
-    files: Files, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    caplog.set_level("INFO", "cpunet")
-    whole, rng = files.data.open().read(), np.random.default_rng(7)
-    law = TailsLaw(2.5, DECAY_US, (100, 300, 900, 2000))
-    left = law.draw(N, rng)[:, np.newaxis]
-    decay = np.exp(-np.arange(whole.length) * DT_NS * 1e-3 / DECAY_US)
-    traces = np.round(whole.waveforms + ADC_PER_KEV * left * decay)
-    write_pulses(tmp_path / "data.lh5", whole.with_waveforms(traces))
-    data = PulseFile(tmp_path / "data.lh5")
-    made = train(files.sim, data, tmp_path / "run", recipe=RECIPE, seed=3, device="cpu")
-    fit = made.fit.model_dump()
-    assert fit["chi_square"] < 1.6 * fit["moments"]
-    assert fit["parameters"]["pole_1_ns"] == pytest.approx(POLE_NS, rel=0.03)
-    assert fit["parameters"]["decay_us"] == pytest.approx(DECAY_US, rel=0.01)
-    told = fit["tails"]
-    assert told["rate_khz"] == pytest.approx(2.5, abs=3.5 * told["rate_error_khz"])
-    assert any(note.startswith("pile-up tails: ") for note in caplog.messages)
-    ren = REN.load(tmp_path / "run")
-    assert ren.tails is not None
-    assert ren.tails.rate_khz == told["rate_khz"]
-    # without tails the noise is that of empty baselines
-    assert fit["noise"]["rms"] == pytest.approx(NOISE_KEV * PREPARED, rel=0.07)

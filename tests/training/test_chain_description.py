@@ -30,7 +30,6 @@ from synthetic import (
     NOISE_SAMPLES,
     load_recipe,
     one_line,
-    status_of,
     write_chain,
     write_run,
 )
@@ -197,6 +196,13 @@ def test_the_truth_of_a_stand(run, tmp_path):
     (stand / "stand.json").write_text(json.dumps(content))
     known = response(run, truth=electronics()).true_values
     assert response(run, truth=stand).true_values == known
+    chain = tmp_path / "chain.yaml"
+    chain.write_text(yaml.safe_dump(content["electronics"]))
+    of_two = response(run, write_response(tmp_path / "run [2]", fit=FIT), truth=chain)
+    assert of_two.true_values == known
+    head, line, *_ = str(of_two).splitlines()[1:]
+    assert head.split()[-4:] == ["run", "run", "[2]", "known"]
+    assert line.split() == ["bandwidth", "pole", "1", "[ns]", "55", "60", "55"]
     assert response(Run.load(run), truth="legend200").truth.name == "legend200"
     (stand / "stand.json").unlink()
     one_line(lambda: response(run, truth=stand), "stand.json: cannot be read")
@@ -211,53 +217,29 @@ def test_every_parameter_has_a_row():
 
 
 def test_runs_that_cannot_be_described(run, tmp_path):
-    out = tmp_path / "out"
-
-    def refused(*runs: Path, parts: tuple[str, ...], truth: Electronics | None = None) -> None:
-        one_line(lambda: response(*runs, truth=truth, out=out), *parts)
-        assert not out.exists()
-
-    refused(tmp_path / "none", parts=("none: no finished run", "cpunet train"))
-    refused(run, tmp_path / "none", parts=("none: no finished run",))
-    refused(parts=("no run was given",))
-    coarse = write_response(tmp_path / "coarse", dt_ns=10.0)
-    refused(coarse, truth=electronics(), parts=(f"{coarse}: ", "electronics known samples"))
-    (coarse / "weights.safetensors").write_bytes(b"")
-    refused(coarse, parts=("weights.safetensors: no readable weights",))
-    (network := tmp_path / "network").mkdir()
+    out, network = tmp_path / "out", tmp_path / "network"
+    coarse, truth = write_response(tmp_path / "coarse", dt_ns=10.0), electronics()
+    network.mkdir()
     write_run(network, {}, load_recipe("published"), FACTS)
-    refused(network, parts=(f"{network}: recipe published trains a network", "cpunet validate"))
-
-
-def test_the_command_prints_a_table_that_is_not_cut(run, tmp_path, capsys):
-    chain = tmp_path / "chain.yaml"
-    chain.write_text(yaml.safe_dump(electronics().model_dump(mode="json")))
-    runs = [run.rename(tmp_path / "a run of a long name [1]")]
-    runs += [write_response(tmp_path / f"another run, {i}", fit=FIT) for i in range(4)]
-    assert status_of("response", *runs, "--truth", chain) == 0
-    printed = capsys.readouterr().out
-    for text in ("a run of a long name [1]", "another run, 3", "known"):
-        assert text in printed
-    line = next(line for line in printed.splitlines() if "bandwidth pole 1" in line)
-    assert line.split()[:9] == ["bandwidth", "pole", "1", "[ns]", "55", *["60"] * 4]
-    assert "late charge [%]" in printed
-    assert "…" not in printed
+    for runs, parts in (
+        ((run, tmp_path / "none"), ("none: no finished run", "cpunet train")),
+        ((), ("no run was given",)),
+        ((coarse,), (f"{coarse}: ", "electronics known samples")),
+        ((network,), (f"{network}: recipe published trains a network", "cpunet validate")),
+    ):
+        one_line(lambda runs=runs: response(*runs, truth=truth, out=out), *parts)
+        assert not out.exists()
 
 
 def test_a_poor_fit_is_doubted(run, tmp_path):
-    info = json.loads((run / "run.json").read_text())
-
-    def doubts(fit: object) -> list[str]:
-        (run / "run.json").write_text(json.dumps(info | {"fit": fit}))
-        return response(run).runs[0].doubts
-
-    assert doubts(FIT) == []
+    assert response(run).runs[0].doubts == []
     checks = {"chi_square": 9.0, "amplitude": 1.0, "z": 30.0, "z_ns": 40.0}
     checks |= {"beyond_ns": [40.0, 48.0], "off": {"onset": 30.0}, "pulses": [1000, 900]}
-    (said,) = doubts(FIT | {"verdict": "bad: chi-square is 9", "checks": checks})
+    fit = FIT | {"verdict": "bad: chi-square is 9", "checks": checks}
+    (said,) = response(write_response(tmp_path / "bad", fit=fit)).runs[0].doubts
     assert said.startswith("the fit is bad: chi-square is 9; ")
     assert said.endswith(PARTS["onset"][1])
-    assert doubts(None) == doubts({}) == []
+    assert response(write_response(tmp_path / "none")).runs[0].doubts == []
     early = write_response(tmp_path / "early", slow={0: -0.4, 2: -0.2})
     (said,) = response(early).runs[0].doubts
     assert said.startswith("60 % of the charge would arrive too early")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -103,15 +102,10 @@ def windows(n: int = 3) -> np.ndarray:
     return charge.astype(np.float32)
 
 
-@pytest.fixture
-def files(tmp_path: Path) -> tuple[Path, Path]:
-    torch.save(state_dict(seed=1), tmp_path / "fep_REN.pt")
-    torch.save(state_dict(seed=2), tmp_path / "fep_IREN.pt")
-    return tmp_path / "fep_REN.pt", tmp_path / "fep_IREN.pt"
-
-
-def test_imported_generators_give_the_published_outputs(files, tmp_path):
-    ren, iren = files
+def test_imported_generators_give_the_published_outputs(tmp_path):
+    ren, iren = tmp_path / "fep_REN.pt", tmp_path / "fep_IREN.pt"
+    torch.save(state_dict(seed=1), ren)
+    torch.save(state_dict(seed=2), iren)
     run = import_weights(tmp_path / "run", ren=ren, iren=iren)
     assert set(run.imported) == {"ren", "iren"}
     pulses = torch.from_numpy(windows())[:, None]
@@ -139,9 +133,7 @@ def test_imported_generators_give_the_published_outputs(files, tmp_path):
     ("change", "words"),
     [
         (lambda s: s.pop("fc_var.bias"), "1 tensors differ, first latent_log_variance.bias"),
-        (lambda s: s.update(more=torch.zeros(1)), "1 tensors differ, first more"),
         (lambda s: s.update({"fc_mean.bias": torch.zeros(3)}), "first latent_mean.bias"),
-        (lambda s: s.pop("inc.double_conv.0.weight"), "no Positional U-Net"),
         (lambda s: s.update({"inc.double_conv.0.weight": torch.zeros(())}), "no Positional"),
     ],
 )
@@ -151,19 +143,8 @@ def test_other_architectures_are_refused_in_one_line(tmp_path, change, words):
     torch.save(state, tmp_path / "other.pt")
     other = tmp_path / "other.pt"
     one_line(lambda: import_weights(tmp_path / "run", ren=other), words, str(other))
-    assert not (tmp_path / "run").exists()
-
-
-def test_broken_weights_are_refused(files, tmp_path):
-    bad = tmp_path / "bad.pt"
-    content = files[0].read_bytes()
-    for write in (
-        lambda: bad.write_bytes(content[: len(content) // 2]),
-        lambda: bad.write_bytes(b""),
-        lambda: torch.save([1, 2], bad),
-        lambda: torch.save({"a": 1}, bad),
-        lambda: bad.unlink(),
-    ):
-        write()
-        one_line(lambda: import_weights(tmp_path / "run", ren=bad))
+    other.write_bytes(other.read_bytes()[:100])
+    one_line(lambda: import_weights(tmp_path / "run", ren=other), "or damaged", str(other))
+    other.unlink()
+    one_line(lambda: import_weights(tmp_path / "run", ren=other), "cannot be read")
     assert not (tmp_path / "run").exists()

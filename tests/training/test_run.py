@@ -14,39 +14,33 @@ from torch import nn
 from cpunet.errors import CpunetError
 from cpunet.networks.positional_unet import PositionalUNet
 from cpunet.training.run import FORMAT, WEIGHTS, Run, used_run
-from games import untrained
+from games import as_published, untrained
 from synthetic import one_line, write_run
 
 INFO = {"recipe": "published", "peak": "FEP", "seed": 1, "dt_ns": 16.0}
 INFO |= {"seconds": 1.5, "device": "cpu"}
 
 
-@pytest.fixture
-def recipe(tiny):
-    return tiny("discriminator.value_range=[-0.1, 1.1]")
+RECIPE = as_published("discriminator.value_range=[-0.1, 1.1]")
 
 
 @pytest.fixture
-def model(recipe) -> dict[str, nn.Module]:
-    return untrained(recipe)
+def model() -> dict[str, nn.Module]:
+    return untrained(RECIPE)
 
 
 @pytest.fixture
-def run(tmp_path: Path, model, recipe) -> Path:
-    write_run(tmp_path, model, recipe, INFO)
+def run(tmp_path: Path, model) -> Path:
+    write_run(tmp_path, model, RECIPE, INFO)
     return tmp_path
 
 
-def blank(recipe) -> PositionalUNet:
-    return PositionalUNet(recipe.generator, recipe.preparation.length)
-
-
-def test_everything_comes_back(run, model, recipe):
+def test_everything_comes_back(run, model):
     found = Run.load(run)
     assert json.loads((run / "run.json").read_text()) == {"format": FORMAT} | INFO
-    assert (found.recipe, found.folder, found.seed, found.fit) == (recipe, run, 1, None)
+    assert (found.recipe, found.folder, found.seed, found.fit) == (RECIPE, run, 1, None)
     for name in ("ren", "iren", "discriminator_data", "discriminator_sim"):
-        fresh = untrained(recipe)[name]
+        fresh = untrained(RECIPE)[name]
         loaded = found.fill(name, fresh.train())
         assert not loaded.training
         saved = model[name].state_dict()
@@ -64,16 +58,12 @@ NO_WEIGHTS = f"{WEIGHTS}: no readable weights; train again"
     ("name", "content", "message"),
     [
         ("run.json", None, "no finished run"),
-        ("run.json", "", "run.json: damaged"),
         ("run.json", "[1]", "run.json: damaged (no mapping)"),
         ("run.json", '{"format": 3, "dt_ns": 16}', "run.json: damaged (no peak)"),
-        ("run.json", facts(dt_ns=-16), "run.json: damaged (dt_ns"),
         ("run.json", facts(seed=-1), "run.json: damaged (seed"),
-        ("run.json", facts(data={"cuts": 3}), "run.json: damaged (data"),
         ("run.json", facts(fit={"errors": [1]}), "run.json: damaged (fit"),
         ("run.json", facts(format=FORMAT + 1), "of another version of cpunet (format 4"),
         ("recipe.yaml", None, "recipe.yaml"),
-        ("recipe.yaml", "a: [\n", "recipe.yaml"),
         ("recipe.yaml", "name: x", "recipe.yaml"),
         *((WEIGHTS, content, NO_WEIGHTS) for content in (None, "", "PK\x03\x04" + 500 * "\0")),
     ],
@@ -85,37 +75,34 @@ def test_a_damaged_run_is_told(run, name, content, message):
     one_line(lambda: Run.load(run), str(run), message)
 
 
-def test_weights_of_another_architecture(run, tiny):
-    other = blank(tiny("generator.width=4"))
-    parts = ("weights.safetensors: weights of another network", "tensors differ")
-    one_line(lambda: Run.load(run).fill("ren", other), *parts)
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda w: w.fill_(torch.nan), "is not finite; train again"),
-        (lambda w: w.view(-1)[:1].fill_(torch.inf), "is not finite; train again"),
+        (lambda w: w.view(-1)[:1].fill_(torch.nan), "is not finite; train again"),
         (lambda w: w.zero_(), "all weights of ren are zero; train again"),
     ],
 )
-def test_weights_that_are_no_numbers(run, recipe, change, message):
+def test_weights_of_another_architecture_or_no_numbers(run, change, message):
+    other, own = (
+        PositionalUNet(of.generator, 64) for of in (as_published("generator.width=4"), RECIPE)
+    )
+    parts = ("weights.safetensors: weights of another network", "tensors differ")
+    one_line(lambda: Run.load(run).fill("ren", other), *parts)
     weights = load_file(run / WEIGHTS)
     for values in weights.values():
         if values.is_floating_point():
             change(values)
     save_file(weights, run / WEIGHTS)
-    one_line(lambda: Run.load(run).fill("ren", blank(recipe)), WEIGHTS, message)
+    one_line(lambda: Run.load(run).fill("ren", own), WEIGHTS, message)
 
 
-def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_factory):
+def test_a_run_in_memory_is_saved_with_its_losses(run, model, tmp_path_factory):
     (run / "losses.jsonl").write_text('{"iteration": 0')
     one_line(lambda: Run.load(run).records, "losses.jsonl: damaged")
     record = {"iteration": 1, "rate": 0.1, "losses": {"cycle": 2.0, "gan": 1.0}}
     (run / "losses.jsonl").write_text(json.dumps(record) + "\n")
     known, copy = Run.load(run), tmp_path_factory.mktemp("saved") / "copy"
-    flat = {"iteration": 1, "rate": 0.1, **record["losses"]}
-    assert known.losses.to_dict("records") == [flat]
+    assert known.records == [record]
     known.save(copy)
     with pytest.raises(CpunetError, match="exists"):
         known.save(copy)
@@ -123,7 +110,7 @@ def test_a_run_in_memory_is_saved_with_its_losses(run, model, recipe, tmp_path_f
         assert (copy / name).read_bytes() == (run / name).read_bytes()
     digest = hashlib.sha256((run / WEIGHTS).read_bytes()).hexdigest()
     assert known.weights_sha256 == digest
-    made = Run.of(model, recipe, peak="FEP", seed=1, dt_ns=16, seconds=1.5, device="cpu")
+    made = Run.of(model, RECIPE, peak="FEP", seed=1, dt_ns=16, seconds=1.5, device="cpu")
     assert (made.weights_sha256, made.records) == (digest, [])
     assert repr(made) == "<Run run in memory: published, FEP>"
 

@@ -190,7 +190,7 @@ def report(run, files, tmp_path_factory) -> cpunet.Report:
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         leave_undrawn(patch)
-        made = run.validate(str(files["sim"].path), files["data"], baselines=False)
+        made = validate(run, str(files["sim"].path), files["data"], baselines=False)
         assert made.folder is None
         assert not list(folder.iterdir())
         made.save("report")

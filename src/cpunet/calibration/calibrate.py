@@ -44,8 +44,9 @@ from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed, yaml_text
 from cpunet.simulation.simulate import HitFile, StoredSimulation, simulate
 from cpunet.training.chain_fit import with_settings
+from cpunet.training.energy_bands import MIN_PULSES
 from cpunet.training.job import TrainingJob, train_chain
-from cpunet.training.pulse_sets import MIN_PULSES, PulseSets
+from cpunet.training.pulse_sets import PulseSets
 from cpunet.training.run import RUN
 
 log = logging.getLogger(__name__)

@@ -5,7 +5,7 @@ drift time :math:`t`.  Velocities and impurities change its density, above all a
 other components :math:`c_i` and the current amplitude :math:`A` are evaluated in slices of the
 drift time: what depends on it, such as the growth of the charge cloud, is thus distinguished
 from what does not, the readout.  With Gaussian bins :math:`g_k` the functions are those of
-`cpunet.training.comparison`, :math:`g_k(t)`, :math:`c_i\, g_k(t)`, and
+`cpunet.training.joint`, :math:`g_k(t)`, :math:`c_i\, g_k(t)`, and
 :math:`g_j(\ln A)\, g_k(t)`.
 """
 
@@ -28,7 +28,8 @@ from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.aligned import Aligned, Floats, stretch
 from cpunet.training.chain_fit import Parabola, SmoothParameters, minimum
-from cpunet.training.comparison import NONE, SEGMENTS, SHRUNK, Difference, Joint, gaussian_bins
+from cpunet.training.comparison import NONE, Difference
+from cpunet.training.joint import SEGMENTS, SHRUNK, Joint, gaussian_bins
 from cpunet.training.pulse_sets import Sides
 
 # Residual that keeps a step within the reach of the derivatives: its size at the reach.
@@ -55,7 +56,7 @@ class SlicedJoint(Joint):
     Parameters
     ----------
     sides, wider
-        See `cpunet.training.comparison.Joint`.
+        See `cpunet.training.joint.Joint`.
     band
         Energies of the pulses, if these are several bands.
     """
@@ -137,7 +138,7 @@ class JointProblem:
         \mathbf{d} = \langle \mathbf{f} \rangle_{\mathrm{sim}}
         - \langle \mathbf{f} \rangle_{\mathrm{data}},
 
-    where :math:`C` is the covariance of `cpunet.training.comparison.Joint`, at the start of
+    where :math:`C` is the covariance of `cpunet.training.joint.Joint`, at the start of
     the problem, and :math:`\mu_i \pm \sigma_i` are the priors.  Parameters of the chain,
     deviations of its step response and free coordinates of the physics are a vector, in this
     order.
@@ -237,7 +238,7 @@ class JointProblem:
         self.chain.set(vector[:own])
         self.along = vector[own:n].copy()
         if len(self.along):
-            self.response.set_deviation(self.modes @ self.along)
+            self.response.deviation[:] = self.modes @ self.along
         self.coordinates = self.coordinates.copy()
         self.coordinates[self.free] = np.clip(vector[n:], self.low[n:], self.high[n:])
 

@@ -56,15 +56,6 @@ class ByHeight(Stored):
         self.step_kev, self.top_kev = np.array(1.0), np.array(1.0)
         self.lag, self.curve = np.zeros(LAG_KNOTS), np.zeros(CURVE_KNOTS)
 
-    @property
-    def vector(self) -> npt.NDArray[np.float64]:
-        """Values at the knots that are free, those of the follower first."""
-        return np.concatenate([self.lag[1:], self.curve[1:-1]])
-
-    def set(self, vector: npt.NDArray[np.float64]) -> None:
-        """Set the values at the knots."""
-        self.lag[1:], self.curve[1:-1] = np.split(vector, [LAG_KNOTS - 1])
-
     def __call__(
         self,
         records: Floats,
@@ -83,22 +74,17 @@ class ByHeight(Stored):
             As it is in baselines, in units of the charge, shape (pulses, samples).  Baselines
             have passed the curve at a height of zero, whose slope is taken out.
         """
-        kev = np.asarray(energy_kev, np.float32)[:, np.newaxis]
-        entering = records + noise / np.float32(1 + self._slope_at_zero)
+        kev, curve = np.asarray(energy_kev, np.float32)[:, np.newaxis], _fine(self.curve)
+        slope = float(curve[1] - curve[0]) * (len(curve) - 1)  # at a height of zero
+        entering = records + noise / np.float32(1 + slope)
         signal = np.asarray(entering * kev, np.float32)
         if self.lag.any():
             moved = np.exp(-_fine(self.lag))
             _follow(signal, moved, PER_STEP * FINE / float(self.step_kev))
         if self.curve.any():
-            added = self.top_kev * _fine(self.curve)
+            added = self.top_kev * curve
             _add(signal, added.astype(np.float32), (len(added) - 1) / float(self.top_kev))
         return np.asarray(signal / kev, records.dtype)
-
-    @property
-    def _slope_at_zero(self) -> float:
-        """Of the curve."""
-        fine = _fine(self.curve)
-        return float(fine[1] - fine[0]) * (len(fine) - 1)
 
     def describe(self, dt_ns: float) -> dict[str, float]:
         """Rate to which `SLEWED` times the largest step is limited, and largest part added."""

@@ -80,20 +80,12 @@ class PositionalUNet(nn.Module):
     residual
         For what is added to a pulse: of charge and current, without batch norm, dropout or
         draw, and 0 at first.
-
-    Raises
-    ------
-    ValueError
-        If the length is not a multiple of 16.
     """
 
     def __init__(self, config: PunetConfig, length: int, *, residual: bool = False) -> None:
         super().__init__()
         self.width, self.residual = config.width, residual
         m = config.width
-        if length % 16:
-            raise ValueError(f"the pulse length {length} is no multiple of 16")
-        self.length = length
         self.inlet = double_convolution(2 if residual else 1, m, m, residual=residual)
         self.down = nn.ModuleList(
             double_convolution(i, o, o, residual=residual)

@@ -188,6 +188,7 @@ class ElectronicsResponse(Stored):
         if config.deviations:
             lags = len(deviation_lags(dt_ns))
             self.deviation_dt_ns = float(dt_ns)  # the response itself may be sampled otherwise
+            # at each lag, and draws whose outer products are its covariance
             self.deviation, self.deviation_draws = np.zeros(lags), np.zeros((DRAWS, lags))
 
     @property
@@ -199,12 +200,6 @@ class ElectronicsResponse(Stored):
             for name, values in self.arrays().items()
             if name not in fixed and not name.startswith("by_height") and len(values)
         }
-
-    def set_deviation(self, deviation: Values, draws: Values | None = None) -> None:
-        """Set the deviation at each lag, and draws whose outer products are its covariance."""
-        self.deviation[:] = deviation
-        if draws is not None:  # (lags, draws)
-            self.deviation_draws[:] = draws.T
 
     def __call__(self, windows: Floats) -> npt.NDArray[np.float32]:
         """Apply the response to prepared simulated pulses.

@@ -177,11 +177,6 @@ class PreparationConfig(Timed):
         return self.samples_before + self.samples_after
 
     @property
-    def align_fraction(self) -> float:
-        """Fraction of the height at which pulses are aligned."""
-        return 0.5 if self.align_at == "half_height" else self.align_at
-
-    @property
     def baseline_samples(self) -> int:
         """Samples at the start of a window that are its baseline."""
         return max(1, self.samples(self.baseline_ns))

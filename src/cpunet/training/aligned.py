@@ -35,11 +35,15 @@ TIE = 1e-6
 SINGLE = np.float32  # derivatives need seven digits
 
 
-@dataclass(frozen=True, eq=False)
 class Frame:
     """What is read of a pulse; numbers of samples from its half height.
 
     Parameters
+    ----------
+    config
+        Times of a recipe, at its sampling period.
+
+    Attributes
     ----------
     dt_ns
         Sampling period in ns.
@@ -51,21 +55,13 @@ class Frame:
         Weights of the current amplitude, see `current_amplitude_kernel`.
     """
 
-    dt_ns: float
-    before: int
-    after: int
-    base: tuple[int, int]
-    level: tuple[int, int]
-    taps: npt.NDArray[np.float32]
-
-    @classmethod
-    def of(cls, config: MatchingConfig) -> Frame:
-        """The frame of a recipe at its sampling period."""
-        after = config.samples(config.after_ns) - 2  # the cubic needs two more samples
+    def __init__(self, config: MatchingConfig) -> None:
+        self.dt_ns, self.before = config.sampled_ns, config.samples(config.before_ns)
+        self.after = config.samples(config.after_ns) - 2  # the cubic needs two more samples
         first, last = (-config.samples(ns) for ns in config.baseline_ns)
-        level = after - config.samples(config.level_ns), after
-        taps, dt_ns = current_amplitude_kernel(config.sampled_ns), config.sampled_ns
-        return cls(dt_ns, config.samples(config.before_ns), after, (first, last), level, taps)
+        self.base = first, last
+        self.level = self.after - config.samples(config.level_ns), self.after
+        self.taps = current_amplitude_kernel(self.dt_ns)
 
 
 @dataclass(frozen=True, eq=False)

@@ -34,7 +34,6 @@ from cpunet.networks.response_layer import (
     deviation_lags,
     padded_length,
 )
-from cpunet.pulses.loading import SideInfo
 from cpunet.recipes.schema import PreparationConfig, ResponseConfig
 from cpunet.tables import counted, percent, with_std
 from cpunet.training.chain_fit import SmoothParameters, with_settings
@@ -127,7 +126,7 @@ def chain_numbers(chain: Chain, preparation: PreparationConfig, dt_ns: float) ->
     for time in (500, 1000):
         numbers[f"missing_{time}_ns"] = float(1 - flat(reaches_ns(step, 0.5) + time))
     numbers["overshoot"] = max(0.0, float(flat(TIMES_NS[LATE_NS[0] > TIMES_NS]).max()) - 1)
-    end_ns = reaches_ns(step, preparation.align_fraction) + preparation.after_ns
+    end_ns = reaches_ns(step, 0.5) + preparation.after_ns  # aligned at half of the height
     tail_ns = np.arange(end_ns - preparation.decay_fit_ns, end_ns, dt_ns)
     slope = np.polyfit(tail_ns, np.log(np.maximum(chain.step(tail_ns), 1e-3)), 1)[0]
     if slope < 0:
@@ -345,7 +344,7 @@ def describe_chain(run: Run) -> DescribedChain:
     network = run.fill("ren", ResponseGenerator(recipe.generator, run.dt_ns))
     response, preparation = network.response, recipe.preparation
     chain = learned_chain(response, Path(run.name).name)
-    aligned_ns = reaches_ns(chain.step(TIMES_NS), preparation.align_fraction)
+    aligned_ns = reaches_ns(chain.step(TIMES_NS), 0.5)
     if int(network.n_baselines):  # converted from the units of prepared pulses to keV
         noise, dt_us = network.noise, 1e-3 * network.noise.dt_ns
         # height of a full charge whose tail has the level of prepared pulses
@@ -394,7 +393,24 @@ def describe_chain(run: Run) -> DescribedChain:
 
 def summary(run: Run) -> list[tuple[str, str]]:
     """Topics and texts on a run."""
-    fit, where = run.fit or FitInfo(), run.name
+    fit, where, sides, parameters = run.fit or FitInfo(), run.name, list[str](), list[str]()
+    for side in (run.sim, run.data):
+        read_as = ", ".join(f"{n} {v}" for n, v in side.read_as.items())
+        text = f"{side.file}" + (f" ({read_as})" if read_as else "")
+        text += f": {side.used} of {side.read} pulses used"
+        lost = counted(side.rejections)
+        text += f", left out {lost}" if lost else ""
+        sides.append("" if side.file is None else text)
+    for name, value in fit.parameters.items():
+        name = name.replace("drift_stretch_per_us", "drift-time scale, per µs")
+        name = name.replace("drift_stretch", "drift-time scale")
+        stem, _, unit = name.rpartition("_")
+        shown = f" {UNITS[unit]}" if unit in UNITS else ""
+        called = (stem if shown else name).replace("_", " ")
+        number = f"{called} {value:.4g}{shown}"
+        if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|deviation|drift-.*", name):
+            number = f"{called}{shown} {percent(100 * value)}"  # a share of the charge
+        parameters.append(number)
     worst = sorted(fit.pulls, key=lambda name: -abs(fit.pulls[name]))[:WORST]
     off = (f"{name} {fit.pulls[name]:+.1f} σ" for name in worst if abs(fit.pulls[name]) > _FAR)
     when = f"{run.started[:16].replace('T', ' ')}, {run.seconds:.4g} s on {run.device}"
@@ -402,12 +418,12 @@ def summary(run: Run) -> list[tuple[str, str]]:
     lines = [
         ("run", where),
         ("trained", f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; {when}"),
-        ("simulated", _side(run.sim)),
-        ("measured", _side(run.data)),
+        ("simulated", sides[0]),
+        ("measured", sides[1]),
         ("fit", fit.verdict),
         ("off", ", ".join(off)),
         *(("cause", cause) for cause in fit.causes),
-        ("response", ", ".join(_parameter(*item) for item in fit.parameters.items())),
+        ("response", ", ".join(parameters)),
         ("delay", f"{fit.delay_ns:.1f} {taken}" if fit.delay_ns else ""),
     ]
     if "baselines" in fit.noise:
@@ -423,25 +439,3 @@ def summary(run: Run) -> list[tuple[str, str]]:
     response = f"cpunet response {where}; " if run.recipe.generator.name == "response" else ""
     lines += [("versions", versions), ("next", f"{response}cpunet validate {where} …")]
     return [(topic, text) for topic, text in lines if text]
-
-
-def _side(side: SideInfo) -> str:
-    if side.file is None:
-        return ""
-    read_as = ", ".join(f"{n} {v}" for n, v in side.read_as.items())
-    text = f"{side.file}" + (f" ({read_as})" if read_as else "")
-    text += f": {side.used} of {side.read} pulses used"
-    lost = counted(side.rejections)
-    return f"{text}, left out {lost}" if lost else text
-
-
-def _parameter(name: str, value: float) -> str:
-    """A parameter of a readout chain; ``slow_100_ns`` and such are shares of the charge."""
-    name = name.replace("drift_stretch_per_us", "drift-time scale, per µs")
-    name = name.replace("drift_stretch", "drift-time scale")
-    stem, _, unit = name.rpartition("_")
-    shown = f" {UNITS[unit]}" if unit in UNITS else ""
-    called = (stem if shown else name).replace("_", " ")
-    if re.fullmatch(r"(slow|decay)_\d\S*_(ns|us)|deviation|drift-.*", name):
-        return f"{called}{shown} {percent(100 * value)}"
-    return f"{called} {value:.4g}{shown}"

@@ -1,6 +1,6 @@
 r"""The parameters of a chain, fitted to unpaired pulses by Gauss and Newton.
 
-The differences :math:`d` of `cpunet.training.comparison` are nearly linear in the coordinates
+The differences :math:`d` of `cpunet.training.joint` are nearly linear in the coordinates
 :math:`x` of `SmoothParameters`.  With their covariance :math:`C`, derivatives
 :math:`J`, and a prior :math:`x_0` of covariance :math:`P`, a step is
 
@@ -23,13 +23,15 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.fft
+import scipy.linalg
 
 from cpunet.errors import CpunetError
 from cpunet.networks.response_layer import ElectronicsResponse, deviation_lags
 from cpunet.pulses.container import FloatArray
 from cpunet.recipes.schema import MatchingConfig
 from cpunet.training.aligned import Values
-from cpunet.training.comparison import Comparison, Difference, Joint, SingleSites
+from cpunet.training.comparison import Comparison, Difference
+from cpunet.training.joint import Joint, SingleSites
 from cpunet.training.pulse_sets import Sides
 
 POLES, DECAY, DECAY_WEIGHTS = "log_poles_ns", "log_decay_us", "decay_weights"
@@ -298,7 +300,10 @@ def fit_chain(
             chi_square, functions = 0.0, 0
             for comparison in compared:
                 difference = differences(parameters, comparison)
-                values, slopes = difference.white
+                root = np.linalg.cholesky(difference.covariance)
+                both = np.column_stack([difference.values, difference.slopes])
+                white = scipy.linalg.solve_triangular(root, both, lower=True)
+                values, slopes = white[:, 0], white[:, 1:]
                 information += slopes.T @ slopes
                 gradient += slopes.T @ values - difference.shared
                 chi_square += float(values @ values)

@@ -9,7 +9,6 @@ equally), and current amplitudes (a readout only makes pulses slower).
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from enum import StrEnum
@@ -37,7 +36,8 @@ from cpunet.pulses.preparation import Kind, Rejection
 from cpunet.pulses.reading.files import ALL, ReadOptions, Source
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import PreparationConfig, Recipe
-from cpunet.training.pulse_sets import MIN_PULSES, spread
+from cpunet.training.energy_bands import MIN_PULSES
+from cpunet.training.pulse_sets import spread
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -158,10 +158,7 @@ class CheckResult:
             lines.append(f"{finding.level:<7}{finding}")
         return "\n".join(lines)
 
-    def __repr__(self) -> str:
-        counts = Counter(finding.level for finding in self.findings)
-        text = ", ".join(f"{n} {mark}" for mark, n in counts.items())
-        return f"<{type(self).__name__}: {text}>"
+    __repr__ = __str__
 
 
 def check(

@@ -33,7 +33,8 @@ from scipy.special import expit
 from cpunet.networks.response_layer import DRAWS, ElectronicsResponse, Spectrum, deviation_lags
 from cpunet.training.aligned import Derivatives, Values
 from cpunet.training.chain_fit import SmoothParameters, with_settings
-from cpunet.training.comparison import NONE, Comparison, Joint, Moved
+from cpunet.training.comparison import NONE, Comparison, Moved
+from cpunet.training.joint import Joint
 from cpunet.training.pulse_sets import MOST, Sides
 
 # Knots in ns: the last of the dense ones and of all, and their spacing.
@@ -241,7 +242,7 @@ def with_deviations(
         problem = Linearised(some, partial(Derivatives, knots.between), width)
         before, far, halved = (np.inf, place), True, 0
         for _ in range(STEPS):
-            own.set_deviation(knots.between @ place)
+            own.deviation[:] = knots.between @ place
             cost = problem.evaluate(own.transfer(padded), place, anew=far)
             count(cost)
             if not cost <= 1.02 * before[0] + 5:  # worse, or no number
@@ -267,14 +268,14 @@ def with_deviations(
                 break
     if not begun:
         return response, NONE
-    own.set_deviation(knots.between @ place)
+    own.deviation[:] = knots.between @ place
     cost = problem.evaluate(own.transfer(padded), place, anew=False)
     if not cost <= before[0]:
         cost, place = before
     alone = problem.evaluate(response.transfer(padded), 0 * place, anew=False)
     if not cost < alone:
         return response, NONE
-    own.set_deviation(knots.between @ place)
+    own.deviation[:] = knots.between @ place
     both = information, problem.information
     return own, _with_amplitude(own, bands, knots, place, both, covariance)
 
@@ -305,15 +306,14 @@ def _with_amplitude(
     information, right = np.eye(n) / LOOSER, np.zeros(n)
     for sides in bands:
         difference = Joint(sides).difference(transfer, along)
-        whitened = partial(
-            scipy.linalg.solve_triangular, np.linalg.cholesky(difference.covariance), lower=True
-        )
-        slopes = whitened(difference.slopes)
+        factor = np.linalg.cholesky(difference.covariance)
+        slopes = scipy.linalg.solve_triangular(factor, difference.slopes, lower=True)
         information += slopes.T @ slopes
-        right -= slopes.T @ whitened(difference.values)
+        right -= slopes.T @ scipy.linalg.solve_triangular(factor, difference.values, lower=True)
         right += difference.shared
     place = place + modes @ np.linalg.solve(information, right)
-    own.set_deviation(knots.between @ place, knots.between @ draws)
+    own.deviation[:] = knots.between @ place
+    own.deviation_draws[:] = (knots.between @ draws).T
     sizes, axes = np.linalg.eigh(root.T @ informations[1] @ root)
     return np.asarray(knots.between @ (root @ axes[:, sizes > 1]))
 

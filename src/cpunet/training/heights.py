@@ -157,9 +157,10 @@ class Unknowns:
         others = np.full(len(self.lag), LAG_STEP), np.full(len(curve), CURVE_STEP)
         self.steps = np.concatenate([PART * self.chain.widths, *others])
         self.centre = np.r_[self.chain.centre, np.zeros(len(self.steps) - self.n)]
-        self.place = np.r_[self.chain.vector(), self.by_height.vector]
-        free = np.full(len(self.steps) - self.n, np.inf)
-        self.bounds = np.r_[self.chain.low, -free], np.r_[self.chain.high, free]
+        free = self.by_height.lag[1:], self.by_height.curve[1:-1]
+        self.place = np.r_[self.chain.vector(), *free]
+        ends = np.full(len(self.steps) - self.n, np.inf)
+        self.bounds = np.r_[self.chain.low, -ends], np.r_[self.chain.high, ends]
 
     def covariance(self, of_lag: float, of_curve: float) -> Values:
         """Of the priors."""
@@ -173,8 +174,9 @@ class Unknowns:
 
     def put(self, vector: Values) -> None:
         """Set chain, follower and curve."""
-        self.chain.set(vector[: self.n])
-        self.by_height.set(vector[self.n :])
+        chain, lag, curve = np.split(vector, [self.n, self.n + LAG_KNOTS - 1])
+        self.chain.set(chain)
+        self.by_height.lag[1:], self.by_height.curve[1:-1] = lag, curve
 
 
 def _solve(

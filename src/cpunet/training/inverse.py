@@ -12,7 +12,6 @@ import numpy as np
 import scipy.fft
 import scipy.linalg
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import LinearInverse, ResponseGenerator, stretch
 from cpunet.networks.response_layer import padding
@@ -20,7 +19,7 @@ from cpunet.pulses.container import FloatArray, Pulses, blocks
 from cpunet.pulses.preparation import prepare
 from cpunet.recipes.schema import Recipe
 from cpunet.training.aligned import Values
-from cpunet.training.pulse_sets import MIN_PULSES
+from cpunet.training.energy_bands import MIN_PULSES
 
 # RMS, in pulse heights, of white noise added to that of the baselines: rounding to float32,
 # and effects that the response does not describe.
@@ -96,29 +95,25 @@ def fit_inverse(
     charge = sim[rows[used]].astype(float)
     wanted = stretch(charge, sample + delay, -inverse.before, inverse.after)
     mean_in, mean_out = measured.mean(axis=0), wanted.mean(axis=0)
-    noise = _noise_covariance(generator.noise, inverse, mean_in)
+
+    # Noise in the region, for a level of 1 and an energy of 1 keV.  The subtracted baseline and
+    # the level by which a window is divided are noisy, too: the former shifts all samples
+    # together, the latter scales the pulse.
+    first = min(-inverse.before, inverse.baseline[0])
+    samples = max(inverse.after, inverse.level[1]) - first
+    density = generator.noise.density_of(max(generator.noise.samples, 2 * samples))
+    correlation = scipy.linalg.toeplitz(scipy.fft.irfft(density)[:samples])
+    base, top = means = np.zeros((2, samples))
+    for row, (begin, stop) in zip(means, (inverse.baseline, inverse.level), strict=True):
+        row[begin - first : stop - first] = 1 / (stop - begin)
+    taken = np.eye(inverse.before + inverse.after, samples, -inverse.before - first)
+    taken = taken - base - np.outer(mean_in, top - base)
+    noise = taken @ correlation @ taken.T
     noise *= float(np.mean(energy_kev[rows] ** -2.0)) / float(level.mean()) ** 2
+
     measured, wanted = measured - mean_in, wanted - mean_out
     own = measured.T @ measured / len(measured) + noise
     own[np.diag_indices(len(own))] += FLOOR**2
     weights = scipy.linalg.solve(own, measured.T @ wanted / len(measured), assume_a="pos").T
     inverse.mean_in[:], inverse.mean_out[:], inverse.weights[:] = mean_in, mean_out, weights
     return inverse
-
-
-def _noise_covariance(noise: BaselineNoise, sizes: LinearInverse, pulse: Values) -> Values:
-    """Covariance of the noise in the region, for a level of 1 and an energy of 1 keV.
-
-    The subtracted baseline and the level by which a window is divided are noisy, too: the
-    former shifts all samples together, the latter scales the pulse.
-    """
-    first = min(-sizes.before, sizes.baseline[0])
-    samples = max(sizes.after, sizes.level[1]) - first
-    density = noise.density_of(max(noise.samples, 2 * samples))
-    correlation = scipy.fft.irfft(density)[:samples]
-    base, level = means = np.zeros((2, samples))
-    for row, (begin, stop) in zip(means, (sizes.baseline, sizes.level), strict=True):
-        row[begin - first : stop - first] = 1 / (stop - begin)
-    taken = np.eye(sizes.before + sizes.after, samples, -sizes.before - first)
-    taken = taken - base - np.outer(pulse, level - base)
-    return np.asarray(taken @ scipy.linalg.toeplitz(correlation) @ taken.T, float)

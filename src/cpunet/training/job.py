@@ -30,8 +30,9 @@ from cpunet.pulses.peaks import parse_selection
 from cpunet.recipes.schema import Recipe
 from cpunet.training.chain_fit import Fitter
 from cpunet.training.check import Level, compare_sides
+from cpunet.training.energy_bands import MIN_PULSES, continuum
 from cpunet.training.inverse import fit_inverse
-from cpunet.training.pulse_sets import MIN_PULSES, Continuum, PulseSets, continuum
+from cpunet.training.pulse_sets import Continuum, PulseSets
 from cpunet.training.response_fit import fit_response
 from cpunet.training.run import INFO, RUN, Record, Run, versions
 from cpunet.training.verdict import DRIFT, FitInfo, beyond

@@ -131,8 +131,8 @@ def _played(
             "simulation": job.sim.fingerprint(),
             "data": job.data.fingerprint(),
         },
+        resume=job.resume,
     )
-    state = run.begin(resume=job.resume)
     pair = (side.prepared.pulses for side in (job.sim, job.data))
     held_out = settings.training.held_out
     sim, data = (Side.of(pulses, held_out, job.seed, job.device) for pulses in pair)
@@ -141,7 +141,7 @@ def _played(
         small = critic.model_copy(update=SMALL.get(critic.name))
         settings = settings.model_copy(update={"discriminator": small})
     sides = Sides(sim, data, recipe.preparation, noise, settings.generator.linear != "none")
-    left = settings.training.iterations - (state["iteration"] if state else 0)
+    left = settings.training.iterations - (run.state["iteration"] if run.state else 0)
     with stage("Training", left) as bar:
 
         def listen(records: list[Record]) -> None:
@@ -153,7 +153,7 @@ def _played(
             job.seed,
             listener=listen,
             save=run.save,
-            start=state,
+            start=run.state,
         )
     return game, run
 

@@ -1,9 +1,4 @@
-"""Two sets of pulses, divided into bands of energy in which they are compared.
-
-Lines and continua have different mixtures of single-site and multi-site events, and noise
-scales as 1/energy.  Pulses of a line are therefore compared with those of the same line, and a
-continuum is compared in bands narrow enough for a constant mixture.  If the spectra of the two
-sides differ within such a band, the simulated pulses are weighted to match the data.
+"""Pulses of both sides with the noise of the data, as they are compared.
 
 A fit compares many responses.  All of them have the same noise, drawn once, so that their
 differences are those of the responses.
@@ -12,7 +7,7 @@ differences are those of the responses.
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -22,25 +17,22 @@ import scipy.fft
 
 from cpunet.electronics.baseline_noise import BaselineNoise, require_energies
 from cpunet.electronics.finishing import padding, record_length
-from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.networks.by_height import ByHeight
 from cpunet.networks.response_layer import ElectronicsResponse, Spectrum, padded_length
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
-from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
-from cpunet.recipes.schema import PeakConfig, Recipe
+from cpunet.recipes.schema import Recipe
 from cpunet.training.aligned import Aligned, Floats, Frame, Samples, Values, read
+from cpunet.training.energy_bands import (
+    MIN_PULSES,
+    EnergyBand,
+    energy_bands,
+    spectrum_weights,
+)
 
-# Ratio of the limits of a band; the next is used only if no band of the previous is possible.
-WIDEST = (1.3, 2.0, 4.0, np.inf)
-# Maximum number of slices of a band in which the spectra are matched, and pulses in a slice.
-SLICES, IN_SLICE = 32, 50
-# The continuum begins where noise is small, and ends well before a line and its sidebands.
-CONTINUUM_FROM_KEV, CLEAR_KEV = 1000.0, 50.0
-HEAVIEST = 5.0  # maximum weight of a simulated pulse before normalisation
-MIN_PULSES, MOST = 200, 4096  # of a side: for a covariance, and most that are compared
-NOISES = 1000  # draws of noise that few pulses have, for the same
+MOST = 4096  # pulses of a side that are compared
+NOISES = 1000  # draws of noise that few pulses have, for a covariance
 DRAWN = 8192  # pulses that give the slope of the tails
 # Maximum number of noise traces, each twice as long as a record.  For more pulses,
 # they share the traces, with other start samples and signs.
@@ -59,141 +51,13 @@ Continuum = Callable[[], tuple[InputSet, InputSet]]
 Rows = slice | Samples | npt.NDArray[np.bool_]
 
 
-@dataclass(frozen=True, eq=False)
-class EnergyBand:
-    """Pulses of both sides that are compared with each other.
-
-    Parameters
-    ----------
-    name
-        A line, or a range in keV.
-    sim, data
-        Samples of the two sides.
-    weights
-        Weights of the simulated pulses, with a mean of 1.
-    """
-
-    name: str
-    sim: Samples
-    data: Samples
-    weights: Values
-
-
-def energy_bands(
-    sim_kev: Values, data_kev: Values, peaks: Mapping[str, PeakConfig]
-) -> list[EnergyBand]:
-    """Divide two sets of pulses into bands of energy.
-
-    Parameters
-    ----------
-    sim_kev, data_kev
-        Energies of the pulses to be compared, on the two sides.
-    peaks
-        Gamma lines.
-
-    Returns
-    -------
-    list of EnergyBand
-        Lines first.  Energies with too few pulses of a side are in no band.
-
-    Raises
-    ------
-    CpunetError
-        If no band has enough pulses of both sides.
-
-    Examples
-    --------
-    >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
-    >>> sim = np.r_[np.full(500, 2614.5), np.linspace(1000, 1200, 900)]
-    >>> data = np.r_[np.full(400, 2614.0), np.linspace(1000, 1200, 800)]
-    >>> [(b.name, len(b.sim), len(b.data)) for b in energy_bands(sim, data, lines)]
-    [('FEP', 500, 400), ('1000-1200 keV', 900, 800)]
-    """
-    labels = [label_peaks(side, peaks) for side in (sim_kev, data_kev)]
-    bands = []
-    for name in peaks:
-        sim, data = (np.flatnonzero(of == name) for of in labels)
-        if min(len(sim), len(data)) >= MIN_PULSES:
-            bands.append(EnergyBand(name, sim, data, np.ones(len(sim))))
-    inside = {band.name for band in bands}
-    sim, data = (np.flatnonzero(~np.isin(of, [*inside])) for of in labels)
-    for widest in WIDEST:
-        bands += _continuum(sim_kev, data_kev, sim, data, widest)
-        if bands:
-            break
-    else:
-        raise CpunetError(
-            f"{len(sim_kev)} simulated and {len(data_kev)} measured pulses; {MIN_PULSES} of "
-            "each at the same energies are needed: select more energies (`peak`), simulate "
-            "more, or give more files"
-        )
-    return bands
-
-
-def _continuum(
-    sim_kev: Values, data_kev: Values, sim: Samples, data: Samples, widest: float
-) -> list[EnergyBand]:
-    """Bands of the pulses that are not in a line, from the highest energy down."""
-    bands, energies = [], (sim_kev, data_kev)
-    rows = [side[np.argsort(-e[side])] for side, e in zip((sim, data), energies, strict=True)]
-    while min(map(len, rows)):
-        top = min(e[r[0]] for r, e in zip(rows, energies, strict=True))
-        rows = [r[e[r] <= top] for r, e in zip(rows, energies, strict=True)]
-        inside = (e[r] >= top / widest for r, e in zip(rows, energies, strict=True))
-        counts = [int(of.sum()) for of in inside]
-        left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
-        if min(counts) >= MIN_PULSES and min(left) < MIN_PULSES and max(left) < 2 * MIN_PULSES:
-            counts = [len(r) for r in rows]  # include a small remainder
-        parts = [np.sort(r[:n]) for r, n in zip(rows, counts, strict=True)]
-        if min(counts) >= MIN_PULSES:
-            low = min(e[r].min() for r, e in zip(parts, energies, strict=True))
-            weights = spectrum_weights(sim_kev[parts[0]], data_kev[parts[1]])
-            if weights.any():
-                name = f"{low:.0f}-{top:.0f} keV"
-                bands.append(EnergyBand(name, parts[0], parts[1], weights))
-        rows = [r[max(n, 1) :] for r, n in zip(rows, counts, strict=True)]
-    return bands
-
-
-def continuum(recipe: Recipe) -> EnergySelection:
-    """Energies below the highest line, away from all lines and from what scores look at.
-
-    Examples
-    --------
-    >>> from cpunet.recipes import load_recipe
-    >>> continuum(load_recipe("fast")).name
-    '1000-1543,1643-2004,2154-2565'
-    """
-    centres = [line.energy_kev for line in recipe.peaks.values()]
-    used = [(kev - CLEAR_KEV, kev + CLEAR_KEV) for kev in centres]
-    used += recipe.scores.continuum_kev.values()
-    ranges, first = [], CONTINUUM_FROM_KEV
-    for low, stop in sorted(used):
-        if low > first:
-            ranges.append(f"{first:.0f}-{low:.0f}")
-        first = max(first, stop)
-    return parse_selection(",".join(ranges), recipe.peaks)
-
-
-def spectrum_weights(sim_kev: Values, data_kev: Values) -> Values:
-    """Weights of simulated pulses that give them the data's spectrum, with a mean of 1.
-
-    All are 0 if the spectra do not overlap.
-    """
-    slices = max(2, min(SLICES, min(len(sim_kev), len(data_kev)) // IN_SLICE))
-    edges = np.quantile(data_kev, np.linspace(0, 1, slices + 1)[1:-1])
-    of_sim, of_data = np.searchsorted(edges, sim_kev), np.searchsorted(edges, data_kev)
-    counts = [np.bincount(of, minlength=slices) for of in (of_sim, of_data)]
-    ratio = (counts[1] / len(data_kev)) / np.maximum(counts[0] / len(sim_kev), 1e-9)
-    weights = np.minimum(ratio, HEAVIEST)[of_sim]
-    return np.asarray(weights / max(weights.mean(), 1e-9))
-
-
-@dataclass(frozen=True, eq=False)
 class Noise:
-    """Noise for a set of pulses, the same at each use.
+    """Noise for records of `length` samples of a set of pulses, the same at each use.
 
-    Parameters
+    The two draws of a pair are of opposite sign, so that the contribution of noise to a mean
+    cancels.
+
+    Attributes
     ----------
     traces
         For an energy of 1 keV, shape (traces, samples).
@@ -205,43 +69,31 @@ class Noise:
         a record, shape (samples,); None for none.
     """
 
-    traces: FloatArray
-    trace: npt.NDArray[np.intp]
-    start: npt.NDArray[np.intp]
-    factor: FloatArray
     left: FloatArray | None = None
     decay: FloatArray | None = None
 
-    @classmethod
-    def draw(
-        cls,
+    def __init__(
+        self,
         noise: BaselineNoise,
         energy_kev: Values,
         length: int,
         pairs: int,
         rng: np.random.Generator,
-    ) -> Noise:
-        """Draw noise for records of `length` samples.
-
-        The two draws of a pair are of opposite sign, so that the contribution of noise to a
-        mean cancels.
-        """
+    ) -> None:
         n = len(energy_kev)
         n_traces = min(NOISE_TRACES, n * pairs)
-        traces = replace(noise, tails=None).draw(np.ones(n_traces), 2 * length, rng)
+        self.traces = replace(noise, tails=None).draw(np.ones(n_traces), 2 * length, rng)
         # each trace is used before any is used again
-        trace = np.concatenate(
-            [rng.permutation(n_traces) for _ in range(-(-n * pairs // n_traces))]
-        )
-        trace = np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)
+        rounds = range(-(-n * pairs // n_traces))
+        trace = np.concatenate([rng.permutation(n_traces) for _ in rounds])
+        self.trace = np.repeat(trace[: n * pairs].reshape(pairs, n), 2, axis=0)
         sign = rng.choice((-1.0, 1.0), (pairs, n))
-        start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
+        self.start = np.repeat(rng.integers(0, length + 1, (pairs, n)), 2, axis=0)
         factor = np.stack([sign, -sign], axis=1).reshape(2 * pairs, n) / energy_kev
-        left = decay = None
+        self.factor = np.asarray(factor, np.float32)
         if (tails := noise.tails) is not None:
-            left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
-            decay = np.asarray(tails.decay(length), np.float32)
-        return cls(traces, trace, start, np.asarray(factor, np.float32), left, decay)
+            self.left = np.stack([tails.factors(energy_kev, rng) for _ in range(2 * pairs)])
+            self.decay = np.asarray(tails.decay(length), np.float32)
 
     def add(self, records: FloatArray, draw: int) -> FloatArray:
         """Records of the pulses with the noise of a draw."""
@@ -306,7 +158,7 @@ class Sides:
         name: str,
         rows: Samples,
     ) -> None:
-        self.frame = frame = Frame.of(recipe.matching.training)
+        self.frame = frame = Frame(recipe.matching.training)
         # height of the plateau of a prepared pulse, to which the noise refers
         self.tail_level = recipe.preparation.tail_level
         self.noise, self.energy_kev, self.name, self.rows = noise, sim.energy_kev, name, rows
@@ -381,10 +233,12 @@ class Sides:
         some = copy.copy(self)
         for name in ("sim", "current", "charge", "spectra", "energy_kev", "rows"):
             setattr(some, name, getattr(self, name)[rows])
-        noise, names = self.noise, ("trace", "start", "factor")
-        drawn = {name: np.ascontiguousarray(getattr(noise, name)[:, rows]) for name in names}
-        left = None if noise.left is None else noise.left[:, rows]
-        some.noise = replace(noise, left=left, **drawn)
+        some.noise = copy.copy(self.noise)
+        for name in ("trace", "start", "factor"):
+            of_rows = np.ascontiguousarray(getattr(self.noise, name)[:, rows])
+            setattr(some.noise, name, of_rows)
+        if self.noise.left is not None:
+            some.noise.left = self.noise.left[:, rows]
         return some
 
     def late_rms(self, aligned: Aligned) -> Values:
@@ -472,12 +326,11 @@ class PulseSets:
 
     def __post_init__(self) -> None:
         require_energies(self.sim.energy_kev)
-        self.bands = list[EnergyBand]()
-        for band in energy_bands(self.sim.energy_kev, self.data.energy_kev, self.recipe.peaks):
+        energies, self.bands = (self.sim.energy_kev, self.data.energy_kev), list[EnergyBand]()
+        for name, sim, data, weights in energy_bands(*energies, self.recipe.peaks):
             # in random order, so that any first part is representative
-            sim, data = (self.rng.permutation(len(side)) for side in (band.sim, band.data))
-            shuffled = band.sim[sim], band.data[data], band.weights[sim]
-            self.bands.append(EnergyBand(band.name, *shuffled))
+            order, other = (self.rng.permutation(len(side)) for side in (sim, data))
+            self.bands.append(EnergyBand(name, sim[order], data[other], weights[order]))
         samples = self.recipe.preparation.decay_fit_samples
         lever = np.arange(samples) - 0.5 * (samples - 1)
         tails = self.data.waveforms[spread(len(self.data), DRAWN), -samples:]
@@ -506,7 +359,7 @@ class PulseSets:
             rows = rows[np.searchsorted(share, (np.arange(len(rows)) + 0.5) / len(rows))]
         sim, measured = sim[rows], data.waveforms[band.data[:MOST]]
         length, pairs = record_length(sim.length, sim.dt_ns), max(1, round(NOISES / len(sim)))
-        noise = Noise.draw(self.noise, sim.energy_kev, length, pairs, self.rng)
+        noise = Noise(self.noise, sim.energy_kev, length, pairs, self.rng)
         finite = np.isfinite(measured).all(axis=1)
         return Sides(sim, measured[finite], noise, self.recipe, band.name, rows)
 

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-MARKER = "response.json"
 RESPONSE = FolderKind(
     name="response", command="cpunet response", own=r"response\.(json|png|yaml|csv|html)"
 )
@@ -169,7 +168,7 @@ class Response:
         folders = [chain.run.folder for chain in self.runs]
         with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
             text = json.dumps(content, indent=1, ensure_ascii=False)
-            (folder / MARKER).write_text(text + "\n", encoding="utf-8")
+            (folder / "response.json").write_text(text + "\n", encoding="utf-8")
             chains = {chain.run.name: chain for chain in self.runs}
             (folder / "response.yaml").write_text(as_yaml(chains), encoding="utf-8")
             (folder / "response.csv").write_text(as_csv(chains), encoding="utf-8")
@@ -202,10 +201,7 @@ class Response:
             rows.append(cells)
         return text_table(head, rows, title="Readout response")
 
-    def __repr__(self) -> str:
-        truth = "" if self.truth is None else f", truth {self.truth.name}"
-        names = ", ".join(Path(chain.run.name).name for chain in self.runs)
-        return f"<{type(self).__name__} of {names}{truth}>"
+    __repr__ = __str__
 
 
 def response(

@@ -107,9 +107,25 @@ class UnfinishedRun:
         From `unfinished_folder`; None for a training that leaves no checkpoint.
     fingerprint
         Everything that determines the weights, by kind (``"recipe"``, ``"seed"``, …).
+    resume
+        Whether to continue from a checkpoint, if the folder has one.
+
+    Attributes
+    ----------
+    state
+        To continue from, or None.
+
+    Raises
+    ------
+    CpunetError
+        If the training was begun with other settings or pulses, or the checkpoint is damaged.
     """
 
-    def __init__(self, folder: Path | None, fingerprint: dict[str, Any]) -> None:
+    state: State | None = None
+
+    def __init__(
+        self, folder: Path | None, fingerprint: dict[str, Any], *, resume: bool = False
+    ) -> None:
         self.folder = folder
         self.started = datetime.now(UTC).isoformat(timespec="seconds")
         self.resumed_at: list[int] = []
@@ -117,22 +133,12 @@ class UnfinishedRun:
         # as a file has it: no tuples, and no subclass of a number or a text
         self._fingerprint = json.loads(json.dumps(fingerprint))
         self.clock = time.perf_counter()  # less the time before, without lost iterations
-
-    def begin(self, *, resume: bool) -> State | None:
-        """The state to continue from, or None.
-
-        Raises
-        ------
-        CpunetError
-            If the training was begun with other settings or pulses, or the checkpoint is
-            damaged.
-        """
-        if not resume or self.folder is None:
-            return None
-        path = self.folder / CHECKPOINT
+        if not resume or folder is None:
+            return
+        path = folder / CHECKPOINT
         if not path.exists():
             log.info("no checkpoint to go on from; beginning at the beginning")
-            return None
+            return
         try:
             then = torch.load(path, map_location="cpu", weights_only=True)
         except (RuntimeError, ValueError, EOFError, pickle.PickleError):
@@ -143,12 +149,11 @@ class UnfinishedRun:
                     f"resumed with another {kind}: {difference}; give what the training "
                     "was begun with, or begin again with `force`"
                 )
-        state: State = then["state"]
+        self.state = state = then["state"]
         self.started, self.records = then["started"], then["records"]
         self.resumed_at = [*then["resumed_at"], state["iteration"]]
         self.clock -= then["seconds"]
         log.info(f"going on after {state['iteration']} iterations")
-        return state
 
     def save(self, state: State) -> None:
         """Store a checkpoint; if that fails, report it, and the previous checkpoint stays."""

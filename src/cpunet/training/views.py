@@ -95,7 +95,15 @@ class Sides(NamedTuple):
 
     def prepared(self, pulses: Tensor) -> Tensor:
         """Windows of translations, scaled as the data are."""
-        return nominal(pulses, self.preparation) if self.scaled else pulses
+        c = self.preparation
+        if not self.scaled:
+            return pulses
+        # of records, where they are if nothing is delayed
+        room = padding(c.sampled_ns)[0] if pulses.shape[1] > c.length else 0
+        window = pulses[:, room : room + c.length]  # (n, samples)
+        window = window - window[:, : c.baseline_samples].mean(dim=1, keepdim=True)
+        level = window[:, -c.tail_samples :].mean(dim=1, keepdim=True) / c.tail_level
+        return window / level.clamp_min(0.1)
 
 
 class Judge:
@@ -145,15 +153,6 @@ class Judge:
             self.over[side], by = "heart", f"and on {100 * own:.0f} % of its own, by heart"
             log.info(f"the critic of {side} is {text}, {by}; its game ends here")
         return float(mean)
-
-
-def nominal(pulses: Tensor, config: PreparationConfig) -> Tensor:
-    """Windows of records, where they are if nothing is delayed, scaled as measured ones."""
-    room = padding(config.sampled_ns)[0] if pulses.shape[1] > config.length else 0
-    window = pulses[:, room : room + config.length]  # (n, samples)
-    window = window - window[:, : config.baseline_samples].mean(dim=1, keepdim=True)
-    level = window[:, -config.tail_samples :].mean(dim=1, keepdim=True) / config.tail_level
-    return window / level.clamp_min(0.1)
 
 
 def half_sample(pulses: Tensor) -> Tensor:

@@ -476,7 +476,7 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
     if any(name.startswith(f"{IREN.part}.") for name in run.weights):
         # pulses of both sides of the fullest peak through both networks and back
         fullest = max(evaluated.sets, key=lambda peak: min(map(len, peak.rows.values())))
-        iren, ren = run.iren, fullest.translations.ren
+        iren, ren = IREN.of(run), fullest.translations.ren
         for forward, back, side, names in (
             (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
             (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
