@@ -115,6 +115,10 @@ class Response:
         self, runs: Sequence[DescribedChain], truth: Electronics | None = None
     ) -> None:
         self.runs, self.truth, self.true_values = runs, truth, dict[str, float]()
+        self._named = dict[str, DescribedChain]()
+        for chain in runs:  # several runs in memory have the same name
+            same = sum(of.run.name == chain.run.name for of in self._named.values())
+            self._named[chain.run.name + f" ({same + 1})" * (same > 0)] = chain
         first = runs[0]
         if truth is not None:
             of_truth, preparation = true_chain_of(truth), first.run.recipe.preparation
@@ -131,7 +135,7 @@ class Response:
         """A row per quantity, a column per run, and ``truth``."""
         from pandas import DataFrame
 
-        columns = {chain.run.name: chain.values for chain in self.runs}
+        columns = {name: chain.values for name, chain in self._named.items()}
         if self.truth is not None:
             columns["truth"] = self.true_values
         return DataFrame(columns).reindex(self.rows)
@@ -156,10 +160,10 @@ class Response:
             If the folder exists and `force` is off, or is of something else.
         """
         runs = [
-            {"path": chain.run.name, "recipe": chain.run.recipe.name}
-            | {name: getattr(chain.run, name) for name in _OF_RUN}
-            | {name: getattr(chain, name) for name in _OF_CHAIN}
-            for chain in self.runs
+            {"path": name, "recipe": chain.run.recipe.name}
+            | {of: getattr(chain.run, of) for of in _OF_RUN}
+            | {of: getattr(chain, of) for of in _OF_CHAIN}
+            for name, chain in self._named.items()
         ]
         content: dict[str, Any] = {"cpunet": cpunet.__version__, "runs": runs}
         if self.truth is not None:
@@ -169,16 +173,16 @@ class Response:
         with folder_written_aside(Path(path), RESPONSE, *folders, force=force) as folder:
             text = json.dumps(content, indent=1, ensure_ascii=False)
             (folder / "response.json").write_text(text + "\n", encoding="utf-8")
-            chains = {chain.run.name: chain for chain in self.runs}
-            (folder / "response.yaml").write_text(as_yaml(chains), encoding="utf-8")
-            (folder / "response.csv").write_text(as_csv(chains), encoding="utf-8")
-            if len(chains) > 1:
-                (folder / "response.html").write_text(array_page(chains), encoding="utf-8")
+            (folder / "response.yaml").write_text(as_yaml(self._named), encoding="utf-8")
+            (folder / "response.csv").write_text(as_csv(self._named), encoding="utf-8")
+            if len(self.runs) > 1:
+                page = array_page(self._named)
+                (folder / "response.html").write_text(page, encoding="utf-8")
             self.plot().savefig(folder / "response.png", dpi=_DPI)
 
     def __str__(self) -> str:
         alone = len(self.runs) == 1  # with several runs errors have no room
-        head = ["", *(Path(chain.run.name).name for chain in self.runs)]
+        head = ["", *(Path(name).name for name in self._named)]
         sources = [(chain.values, chain.errors if alone else {}) for chain in self.runs]
         if self.truth is not None:
             head += [self.truth.name, *(["difference", "σ"] if alone else [])]
