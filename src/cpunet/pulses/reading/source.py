@@ -222,7 +222,7 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     name
         Location of the traces in the file.
     n_pulses
-        Number of traces; None if it is unknown without reading the whole file.
+        Number of traces.
     length
         Samples per trace.
     rows
@@ -234,14 +234,14 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         Sampling periods ``dt`` and times of the first samples ``t0`` that are no columns.
     attrs
         What the file says about the traces: side, maker, detector.
-    of_each
-        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
-        ``t0_ns``, and ``dt_ns`` if there are several.
     group, close
         Group of an HDF5 file with columns of any kind; closes the file.
 
     Attributes
     ----------
+    of_each
+        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
+        ``t0_ns``, and ``dt_ns`` if there are several.
     chosen, n_all
         Rows of the table that are read, and how many it has; None if all are.
     dt_ns
@@ -255,15 +255,15 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     path: Path
     format: str
     name: str
-    n_pulses: int | None
+    n_pulses: int
     length: int
     rows: Read
     columns: dict[str, Column] = field(default_factory=dict)
     times: dict[str, Column] = field(default_factory=dict)
     attrs: Mapping[str, str] = field(default_factory=dict)
-    of_each: dict[str, Any] = field(default_factory=dict)
     group: h5py.Group | None = None
     close: Callable[[], None] = lambda: None
+    of_each: dict[str, Any] = field(default_factory=dict, init=False)
     chosen: npt.NDArray[np.int64] | None = field(default=None, init=False)
     n_all: int | None = field(default=None, init=False)
     dt_ns: float = field(default=np.nan, init=False)
@@ -290,13 +290,12 @@ class PulseSource(AbstractContextManager["PulseSource"]):
                 f"{self.length}: their dimensions are reversed",
                 "write them transposed, with the pulses first",
             )
-        if n is not None:
-            self._choose(file.rows, n)
+        self._choose(file.rows, n)
         self._sample(file.dt_ns)
         self._calibrate(file.energy, file.kev_per_adc)
         t0 = self.times.get("t0")
         if t0 is not None and (by := factor(t0.units, "ns")) is not None:
-            self.of_each["t0_ns"] = np.broadcast_to(by * t0.values, (self.n_pulses or 0,))
+            self.of_each["t0_ns"] = np.broadcast_to(by * t0.values, (self.n_pulses,))
         if name := next((name for name in EVENT_KEYS[:-1] if name in self.columns), None):
             self.of_each["event_number"] = self._of_each(name, self.columns[name])
         return self
@@ -304,12 +303,12 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     def _of_each(self, name: str, column: Column) -> Values:
         """Values of a column, which must be as many as there are traces, or one for all."""
         values, n = column.values, self.n_pulses
-        if n is not None and values.shape not in ((), (n,)):
+        if values.shape not in ((), (n,)):
             raise CpunetError(
                 f"{self.path}: column {name} has {len(values)} values for {n} waveforms; "
                 "give the column of the same events"
             )
-        return np.atleast_1d(values) if n is None else np.broadcast_to(values, (n,))
+        return np.broadcast_to(values, (n,))
 
     def _choose(self, wanted: Mapping[str, str], n: int) -> None:
         """Choose rows by values of some columns; all must be of one channel."""
@@ -439,45 +438,25 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         Raises
         ------
         CpunetError
-            If the file is damaged or contains no pulses, or if its events differ in length or
-            sampling period.
+            If the file is damaged, or if its events differ in length or sampling period.
         """
-        size, start = min(size, max(1, BLOCK_BYTES // (4 * self.length))), 0
-        while start != self.n_pulses:
-            traces = self.rows(start, start + size)
-            if not len(traces):
-                break
-            yield self._pulses(start, traces)
-            start += len(traces)
-        if start == 0:
-            raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
-        if (energies := len(self.of_each.get("energy_kev", range(start)))) != start:
-            raise CpunetError(
-                f"{self.path}: {start} waveforms, but {energies} energies; "
-                "give the energies of the same events"
-            )
+        size = min(size, max(1, BLOCK_BYTES // (4 * self.length)))
+        return (self._pulses(start, start + size) for start in range(0, self.n_pulses, size))
 
-    def read(self, start: int = 0, stop: int | None = None) -> Pulses:
-        """Read all pulses of the file, or some rows, at once; they must fit in memory."""
-        if stop is None:
-            return Pulses.concatenate(list(self.blocks()))
-        return self._pulses(start, self.rows(start, stop))
+    def read(self) -> Pulses:
+        """Read all pulses of the file at once; they must fit in memory."""
+        return Pulses.concatenate(list(self.blocks()))
 
-    def _pulses(self, start: int, traces: npt.NDArray[Any]) -> Pulses:
-        """Traces with their energies, numbers and times."""
+    def _pulses(self, start: int, stop: int) -> Pulses:
+        """Traces of some rows with their energies, numbers and times."""
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
-            waveforms = np.asarray(traces, np.float32)
+            waveforms = np.asarray(self.rows(start, stop), np.float32)
         n = len(waveforms)
         of_each = {name: values[start : start + n] for name, values in self.of_each.items()}
         numbers = of_each.get("event_number", np.arange(start, start + n))
         energy_kev = of_each.get("energy_kev")
         if energy_kev is None and self.kev_per_adc is not None:
             energy_kev = self.kev_per_adc * amplitude(waveforms)
-        if energy_kev is not None and len(energy_kev) != n:
-            raise CpunetError(
-                f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
-                "give the energies of the same events"
-            )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
         periods = of_each.get("dt_ns", np.full(n, self.dt_ns))
         other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
@@ -488,11 +467,10 @@ class PulseSource(AbstractContextManager["PulseSource"]):
                 f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
                 "split the file by sampling period"
             )
-        t0_ns = of_each.get("t0_ns", 0.0)
         return Pulses.of(
             waveforms,
             dt_ns=self.dt_ns,
             energy_kev=energy_kev,
             event_number=event_number,
-            t0_ns=t0_ns,
+            t0_ns=of_each.get("t0_ns", 0.0),
         )
