@@ -1,4 +1,4 @@
-"""What `info` says of files, detectors and folders, and what `load` opens."""
+"""What `info` says of files, detectors and folders."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from cpunet import CpunetError, FileOptions, PulseFile, info, load
+from cpunet import CpunetError, FileOptions, PulseFile, info
 from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
@@ -47,15 +47,6 @@ def test_a_file_of_pulses(tmp_path):
     }
 
 
-def test_a_file_is_opened(tmp_path):
-    path = tmp_path / "pulses.lh5"
-    write_pulses(path, Pulses.of(np.zeros((3, 20)), dt_ns=16))
-    assert load(path) == PulseFile(path)
-    (tmp_path / "text").write_text("no pulses")
-    with pytest.raises(CpunetError, match="text"):
-        load(tmp_path / "text")
-
-
 def test_tails_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
@@ -71,7 +62,6 @@ def test_a_run_folder(tmp_path):
     lines = dict(info(tmp_path).lines)
     assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
-    assert load(tmp_path).summary() == info(tmp_path).lines
     assert lines["pile-up tails"] == "none significant"
 
 

@@ -266,7 +266,7 @@ def test_pulses_in_memory_do_what_files_do(home, tmp_path):
     assert (len(sim), len(sim[:7]), len(sim[sim.energy_kev > 0])) == (N, 7, N - 1)
     assert repr(data).startswith(f"<{N} pulses of 1200 samples, 16 ns each")
     assert list(sim.to_dataframe()) == ["event_number", "energy_kev", "peak"]
-    file = cpunet.load(sim.save(tmp_path / "sim.lh5"))
+    file = cpunet.PulseFile(sim.save(tmp_path / "sim.lh5"))
     assert repr(file) == f"<PulseFile {tmp_path / 'sim.lh5'}>"
     np.testing.assert_array_equal(file.open().read().waveforms, sim.waveforms)
     assert "fast" in cpunet.list_recipes()
@@ -275,7 +275,7 @@ def test_pulses_in_memory_do_what_files_do(home, tmp_path):
     run = cpunet.train(sim, data, recipe=load_recipe("fast", SHORT), device="cpu")
     assert run.folder is None
     saved = run.save(tmp_path / "run")
-    assert cpunet.load(tmp_path / "run").fit == saved.fit
+    assert cpunet.Run.load(tmp_path / "run").fit == saved.fit
 
     two = run.ren.translate(sim.waveforms[:2], noise=False)
     assert two.shape == (2, 800)

@@ -50,8 +50,6 @@ order in which data flow.
 
 ::: cpunet.info
 
-::: cpunet.load
-
 ::: cpunet.check
 
 ::: cpunet.response
@@ -71,8 +69,6 @@ order in which data flow.
 ::: cpunet.make_library
 
 ::: cpunet.translate_library
-
-::: cpunet.merge_libraries
 
 ::: cpunet.LegendParameters
 

@@ -1,4 +1,4 @@
-"""Opens whatever this program reads or makes, and says what is in it."""
+"""Says what is in whatever this program reads or makes."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import cpunet
 from cpunet.errors import CpunetError
@@ -22,8 +22,6 @@ from cpunet.tables import Lines, aligned, text_table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
-
-    Loaded: TypeAlias = cpunet.Run | cpunet.Report | cpunet.Stand | PulseFile
 
 _DPI = 150
 
@@ -151,12 +149,7 @@ def info(
     if out is not None or values:
         raise CpunetError(f"{path}: is no detector", "leave out `settings` and `out`")
     if place.is_dir():
-        content = load(path)
-        if isinstance(content, cpunet.Run):
-            return InfoResult(str(path), content.summary())
-        verdicts = getattr(content, "verdicts", None)
-        lines = [("report", str(path)), *(("", verdict) for verdict in verdicts or ())]
-        return InfoResult(str(path), lines if verdicts else [("", str(content))])
+        return InfoResult(str(path), _folder(place))
     try:
         return _file(pulse_file(path, read), recipe, quality)
     except CpunetError:
@@ -168,35 +161,17 @@ def info(
     return InfoResult(str(path), lines)
 
 
-def load(path: str | Path) -> Loaded:
-    """Open what this program reads or makes.
-
-    Parameters
-    ----------
-    path
-        Folder of a run, report or stand, or a file of pulses.
-
-    Returns
-    -------
-    Run, Report, Stand or PulseFile
-
-    Raises
-    ------
-    CpunetError
-        If it is none of these, or cannot be read.
-    """
-    path = Path(path)
-    if not path.is_dir():
-        file = PulseFile(path)
-        file.open()
-        return file
-    for name, kind in (
-        ("run.json", cpunet.Run), ("metrics.json", cpunet.Report), ("stand.json", cpunet.Stand),
-    ):  # fmt: skip
-        if (path / name).is_file():
-            return kind.load(path)
+def _folder(folder: Path) -> Lines:
+    if (folder / "run.json").is_file():
+        return cpunet.Run.load(folder).summary()
+    if (folder / "metrics.json").is_file():
+        report = cpunet.Report.load(folder)
+        verdicts = [("", verdict) for verdict in report.verdicts]
+        return [("report", str(folder)), *verdicts] if verdicts else [("", str(report))]
+    if (folder / "stand.json").is_file():
+        return [("", str(cpunet.Stand.load(folder)))]
     raise CpunetError(
-        f"{path}: no folder of this program",
+        f"{folder}: no folder of this program",
         "give the folder of a run, which holds run.json, of a report or stand, or a file",
     )
 

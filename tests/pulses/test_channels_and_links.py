@@ -144,7 +144,10 @@ def test_columns_that_are_links_to_other_files(tmp_path, part):
 
 @pytest.mark.parametrize(
     ("link", "said"),
-    [(h5py.ExternalLink("none.lh5", "ch/raw"), "none.lh5"), (h5py.SoftLink("/none"), "not found")],
+    [
+        (h5py.ExternalLink("none.lh5", "ch/raw"), "none.lh5"),
+        (h5py.SoftLink("/none"), "not found"),
+    ],
 )
 @pytest.mark.parametrize("place", ["ch2", "ch2/raw", "raw/energy"])
 def test_a_broken_link_is_named(tmp_path, link, said, place):

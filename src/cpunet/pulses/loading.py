@@ -48,7 +48,6 @@ MAX_KEV, MIN_KEV = 20_000.0, 20.0
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 # Windows are shorter by these if so many more of a file's first traces contain them.
 SHORTER_NS, MORE, TRIED = range(320, 3201, 320), 0.01, 1024
-SWAPPED = "are `sim` and `data` swapped?"
 
 
 _OR_PAD = "or allow more preparation.padding_before_ns and padding_after_ns"
@@ -196,7 +195,8 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     with file.open() as source:
-        provenance.require_side(source, side, SWAPPED, insist=file.insist)
+        remedy = "are `sim` and `data` swapped?"
+        provenance.require_side(source, side, remedy, insist=file.insist)
         inputs, whole = _read(source, file, side, recipe, selection, max_pulses, shorten)
     recipe, prepared = inputs.recipe.at(inputs.dt_ns), inputs.prepared
     if inputs.baselines is not None:

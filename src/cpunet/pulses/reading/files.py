@@ -139,14 +139,13 @@ class PulseFile:
     def open(self) -> PulseSource:
         """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
         # HDF5 takes a fifth of a second to import
-        format_ = "memory" if self.pulses is not None else recognise(self.path)
-        if format_ == "HDF5":
+        if self.pulses is None and recognise(self.path) == "HDF5":
             from cpunet.pulses.reading.hdf5 import read_hdf5
 
             return read_hdf5(self).resolve(self)
-        from cpunet.pulses.reading.other_formats import READERS
+        from cpunet.pulses.reading.other_formats import read_memory, read_numpy
 
-        return READERS[format_](self).resolve(self)
+        return (read_memory if self.pulses is not None else read_numpy)(self).resolve(self)
 
 
 Source: TypeAlias = str | Path | PulseFile | Pulses
@@ -181,10 +180,13 @@ def pulse_file(
 _FORMATS = {
     "HDF5": rb"(.{512})?\x89HDF\r\n\x1a\n",  # MATLAB writes 512 bytes of its own before it
     "NumPy": rb"\x93NUMPY|PK\x03\x04",
-    "pickle": rb"\x80[\2-\5]",
 }
 _AS_NPZ = "numpy.savez(FILE, waveform=…, energy_kev=…, dt_ns=…)"
 _FOREIGN = {  # what cannot be read, and what to do
+    rb"\x80[\2-\5]": (
+        "pickled",
+        f"load it with pickle if you trust it, and {_AS_NPZ}",
+    ),
     rb".{4}FlashCam": ("FlashCam", "convert it with legend-daq2lh5"),
     rb"root": ("ROOT", f"read its traces with uproot, write them with {_AS_NPZ}"),
     rb"MATLAB 5\.0": ("MATLAB 5", "save it with -v7.3"),
@@ -205,8 +207,8 @@ def open_pulses(
 ) -> PulseSource:
     """Open a file of pulses; the format is recognised by its content.
 
-    Supported formats are LH5 (waveform tables, plain or encoded) and other HDF5, NumPy ``.npz``
-    and ``.npy``, and CPU-Net's pickled pulses.
+    Supported formats are LH5 (waveform tables, plain or encoded) and other HDF5, and NumPy's
+    ``.npz`` and ``.npy``.
 
     Parameters
     ----------
@@ -281,6 +283,4 @@ def recognise(path: Path) -> str:
     for start, (program, remedy) in _FOREIGN.items():
         if re.match(start, head, re.DOTALL):
             raise CpunetError(f"{path}: is a {program} file, which is not read", remedy)
-    raise CpunetError(
-        f"{path}: of no known format; give LH5, HDF5, NumPy .npz or .npy, or pickled pulses"
-    )
+    raise CpunetError(f"{path}: of no known format; give LH5, HDF5, or NumPy .npz or .npy")

@@ -1,17 +1,7 @@
-"""Pulses in memory, of NumPy's ``.npz`` and ``.npy``, and of pickles.
-
-The authors of CPU-Net published files of pickled dictionaries.  The layout is that of the
-README of their repository (kevinhbhimani/CPU-Net on GitHub) for the record
-10.5281/zenodo.15311838: files such as ``fep_wf_ornl.pickle`` and ``fep_wf_sim.pickle``, in
-which one pickle follows the other, each a dictionary ``{wf, tp0, energy}`` of samples, index of
-the rise and energy in keV; their ``dataset.py`` also knows ``event`` and ``dc_label``.  A
-pickle is a program that can call any function by name; only the names with which NumPy stores
-arrays and numbers are allowed.
-"""
+"""Pulses in memory, and of NumPy's ``.npz`` and ``.npy``."""
 
 from __future__ import annotations
 
-import pickle
 import zipfile
 import zlib
 from contextlib import suppress
@@ -109,81 +99,3 @@ def read_numpy(options: PulseFile) -> PulseSource:
         if values.ndim <= 1 or 1 in values.shape
     }
     return _of_array(options.path, "NumPy", name, arrays[name], columns)
-
-
-# NumPy 1 calls its package numpy.core, NumPy 2 numpy._core
-_CORE = {"_reconstruct": "multiarray", "scalar": "multiarray", "_frombuffer": "numeric"}
-_ALLOWED = {("numpy", "dtype"), ("numpy", "ndarray"), ("_codecs", "encode")}
-_ALLOWED |= {
-    (f"numpy.{core}.{_CORE[name]}", name) for core in ("core", "_core") for name in _CORE
-}
-_OTHERS = "write the pulses of one length without other entries"
-
-
-class _Unpickler(pickle.Unpickler):
-    def find_class(self, module: str, name: str) -> Any:
-        if (module, name) not in _ALLOWED:
-            raise CpunetError(
-                f"asks for {module}.{name}, which no list of pulses needs; refused, nothing of "
-                "it was executed"
-            )
-        return super().find_class(module, name)
-
-
-def read_pickles(options: PulseFile) -> PulseSource:
-    """Read pickled dictionaries, one after the other or in lists; all are held in memory.
-
-    Raises
-    ------
-    CpunetError
-        If the file is damaged, asks for more than arrays and plain containers, or holds more
-        than pulses of one length.
-    """
-    path = options.path
-    if options.table is not None:
-        raise CpunetError(f"{path}: a file of pickled pulses has no tables; leave out `table`")
-    entries = list[Any]()
-    with path.open("rb") as stream:
-        while stream.peek(1):
-            try:
-                value = _Unpickler(stream).load()
-            except CpunetError as error:
-                raise CpunetError(f"{path}: {error}") from error
-            except Exception as error:  # a damaged pickle can raise anything
-                raise CpunetError(
-                    f"{path}: breaks off after {len(entries)} entries "
-                    f"({' '.join(str(error).split())}); download it again"
-                ) from error
-            entries += value if isinstance(value, list | tuple) else [value]
-    traces, events = list[npt.NDArray[np.float32]](), list[int]()
-    numbers = list[dict[str, float]]()
-    for place, entry in enumerate(entries):
-        try:
-            with np.errstate(over="ignore"):  # values beyond single precision are counted later
-                trace = np.asarray(entry["wf"], np.float32)
-            events.append(int(entry.get("event", place)))
-            names = entry.keys() & {"tp0", "energy", "dc_label"}
-            numbers.append({name: float(entry[name]) for name in names})
-        except (TypeError, ValueError, LookupError, AttributeError, OverflowError) as error:
-            raise CpunetError(
-                f"{path}: entry {place} is no pulse (a dictionary of wf and numbers); {_OTHERS}"
-            ) from error
-        length = len(traces[0]) if traces else trace.size
-        if trace.shape != (length,):
-            raise CpunetError(
-                f"{path}: entry {place}: {trace.size} samples, before it {length}; {_OTHERS}"
-            )
-        traces.append(trace)
-    columns = {"event_number": Column.of(np.array(events, np.int64))}
-    for name in sorted(set().union(*numbers)):
-        values = np.array([row.get(name, np.nan) for row in numbers])
-        columns[name] = Column.of(values, "keV" if name == "energy" else "")
-    waveforms = np.stack(traces) if traces else np.empty((0, 0), np.float32)
-    return _of_array(path, "pickled pulses", "", waveforms, columns)
-
-
-READERS = {
-    "memory": read_memory,
-    "NumPy": read_numpy,
-    "pickle": read_pickles,
-}

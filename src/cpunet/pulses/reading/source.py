@@ -70,8 +70,8 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
 
 
 Values = npt.NDArray[Any]
-Read = Callable[[int, int], Values]  # rows from one to before another
 Texts = npt.NDArray[np.str_]
+Read = Callable[[int, int], Values]  # rows from one to before another
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,8 +212,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
 
     The reader of a format gives the content, and `resolve` the sampling period and the
     energies.  The file is closed at the end of a ``with``, or with the last reference to this.
-    The memory in use does not grow with the traces of a file, except for ``.npz`` and pickles,
-    which are read as a whole.
+    The memory in use does not grow with the traces of a file, except for ``.npz``, which is
+    read as a whole.
 
     Parameters
     ----------
