@@ -159,10 +159,8 @@ def run(words: Sequence[str]) -> int:
 
 def main() -> None:
     """Run the command line: it ends in one line on stderr, if anything goes wrong."""
-    words = sys.argv[1:]
-    end = words.index("--") if "--" in words else len(words)  # then names only
-    debug = DEBUG in words[:end]  # wherever it stands
-    words = [word for word in words[:end] if word != DEBUG] + words[end:]
+    debug = DEBUG in sys.argv  # wherever it stands
+    words = [word for word in sys.argv[1:] if word != DEBUG]
     logger, handler = logging.getLogger("cpunet"), logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Lines())
     level = logger.level

@@ -62,14 +62,15 @@ def item_at(group: h5py.Group, path: str) -> h5py.Group | h5py.Dataset | None:
     CpunetError
         If it is a link that leads nowhere.
     """
-    if not path or group.get(path, getlink=True) is None:
+    if not path or (link := group.get(path, getlink=True)) is None:
         return None if path else group
     try:
         return group[path]
     except (KeyError, OSError, RuntimeError) as error:
+        to = ":".join(getattr(link, n) for n in ("filename", "path") if hasattr(link, n))
         why = str(error).strip("'\"")
         raise CpunetError(
-            f"{group.file.filename}: {path} cannot be opened ({why})",
+            f"{group.file.filename}: {path} cannot be opened: {to} ({why})",
             "if it is a link, put its target in place, or choose another table",
         ) from error
 
@@ -107,11 +108,6 @@ def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
         return ""
     value = value.item() if isinstance(value, np.ndarray) and value.size == 1 else value
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
-
-
-def texts_of(item: h5py.Group | h5py.Dataset) -> dict[str, str]:
-    """All attributes of an item as text."""
-    return {name: text_attribute(item, name) for name in item.attrs}
 
 
 def units_of(item: h5py.Group | h5py.Dataset) -> str:

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import cpunet
 from cpunet.errors import CpunetError
@@ -19,9 +17,6 @@ from cpunet.settings import Set, key_values
 from cpunet.simulation.geometry_readers import holds_detector, read_detector
 from cpunet.simulation.hit_files import describe_hits, holds_hits
 from cpunet.tables import Lines, aligned, text_table
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 _DPI = 150
 
@@ -43,39 +38,12 @@ class InfoResult:
     path: str
     lines: Lines
     ok: bool = True
-    _draw: Callable[[], Figure] | None = None
 
     def __str__(self) -> str:
         return aligned(self.lines)
 
     def __repr__(self) -> str:
         return f"<InfoResult {self.path}>"
-
-    def plot(self) -> Figure:
-        """Draw the fields of a detector.
-
-        Raises
-        ------
-        CpunetError
-            If it is none.
-        """
-        if self._draw is None:
-            raise CpunetError(f"{self.path}: is no detector to draw", "leave out `out`")
-        return self._draw()
-
-    def save(self, path: str | Path, force: bool = False) -> None:
-        """Write the figure as ``.png``, ``.pdf`` or ``.svg``.
-
-        Raises
-        ------
-        CpunetError
-            If the file exists and `force` is off, or there is no figure.
-        """
-        path = Path(path)
-        refuse_picture(path, self.path, force=force)
-        figure = self.plot()
-        with written_aside(path) as aside:
-            figure.savefig(aside, format=path.suffix[1:].lower(), dpi=_DPI)
 
 
 def info(
@@ -137,15 +105,13 @@ def info(
         detector = read_detector(path, values)
         fields = compute_fields(detector)
 
-        def draw() -> Figure:
+        if out is not None:
             from cpunet.simulation.detector_figure import detector_figure
 
-            return detector_figure(detector, fields)
-
-        of_detector = InfoResult(str(path), fields_in_words(detector, fields), _draw=draw)
-        if out is not None:
-            of_detector.save(out, force)
-        return of_detector
+            figure = detector_figure(detector, fields)
+            with written_aside(Path(out)) as aside:
+                figure.savefig(aside, format=Path(out).suffix[1:].lower(), dpi=_DPI)
+        return InfoResult(str(path), fields_in_words(detector, fields))
     if out is not None or values:
         raise CpunetError(f"{path}: is no detector", "leave out `settings` and `out`")
     if place.is_dir():

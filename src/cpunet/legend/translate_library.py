@@ -51,7 +51,6 @@ from cpunet.units import factor, unit_names
 
 log = logging.getLogger(__name__)
 
-LARGEST_MM = 500.0  # upper limit of coordinates in a crystal
 ROWS = 16  # rows of r read at a time
 MIN_END = 0.5  # of the maximum; templates of charge end near it, those of current do not
 STEP_SAMPLE, STEP_LENGTH = 500, 3000  # of a charge step to measure the delay
@@ -302,11 +301,6 @@ def library_axes(file: h5py.File, path: str, source: Path) -> tuple[Values, Valu
         if not (np.isfinite(values).all() and (np.diff(values) > 0).all()):
             raise CpunetError(
                 f"{where}: {name} does not ascend from node to node; write the library again"
-            )
-        if np.abs(values).max() > LARGEST_MM:
-            raise CpunetError(
-                f"{where}: {name} reaches {np.abs(values).max():g} mm, beyond any crystal; are "
-                f"its units ({units}) right?"
             )
         axes.append(values)
     dt, units = group["dt"], units_of(group["dt"])

@@ -7,7 +7,9 @@ the size of the file.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -316,6 +318,9 @@ def _read(
         _thin(sets, drawn, max_pulses)
     if highest >= lowest and (first == first.round()).all():
         counts = int(lowest), int(highest)
+    detector: str | None = None
+    with suppress(ValueError, LookupError, TypeError):  # other programs may have such a name
+        detector = str(json.loads(source.attrs[provenance.SIMULATION])["detector"]["name"])
     inputs = InputSet(
         _joined(sets),
         source.dt_ns,
@@ -324,7 +329,7 @@ def _read(
         recipe=recipe,
         cuts=None,
         read_as=file.options,
-        detector=provenance.recorded_detector(source),
+        detector=detector,
         baselines=Baselines.concatenate(baselines) if measured else None,
         counts=counts,
     )

@@ -111,13 +111,6 @@ def recorded_side(source: PulseSource) -> Recognised | None:
     return None
 
 
-def recorded_detector(source: PulseSource) -> str | None:
-    """Name of the simulated detector; None if the file does not contain it."""
-    with suppress(ValueError, LookupError, TypeError):
-        return str(json.loads(source.attrs[SIMULATION])["detector"]["name"])
-    return None
-
-
 def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
     """Side that pulses appear to be of; None if it is ambiguous.
 

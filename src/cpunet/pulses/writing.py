@@ -148,10 +148,11 @@ class PulseWriter:
         attrs
             Attributes of the table.
         """
-        content = {
-            name: column if isinstance(column, LGDO) else _array(*column)
-            for name, column in columns.items()
-        }
+        content = dict(columns)
+        for name, column in columns.items():
+            if not isinstance(column, LGDO):
+                attrs_of = {"units": column[1]} if column[1] else {}
+                content[name] = Array(np.asarray(column[0]), attrs=attrs_of)
         if len(next(iter(content.values()))) == 0:
             return
         group, _, name = table.strip("/").rpartition("/")
@@ -163,10 +164,6 @@ class PulseWriter:
         """Set an attribute of the table of pulses after the first block, or of the `file`."""
         item = self._file if file else self._file[self.table.strip("/")]
         item.attrs[name] = text
-
-
-def _array(values: npt.ArrayLike, units: str) -> Array:
-    return Array(np.asarray(values), attrs={"units": units} if units else {})
 
 
 class HeldFile(io.FileIO):
@@ -281,11 +278,11 @@ def _rows(item: Any, units: str, chosen: npt.NDArray[Any] | None, start: int, n:
     some = None if chosen is None else chosen[start : start + n]
     if _is_lh5(item):
         return lh5_rows(item, 0 if some is not None else start, n, some)
+    attrs = {"units": units} if units else {}
     if item.ndim == 0:
-        return _array(np.full(n, item[()]), units)
+        return Array(np.full(n, item[()]), attrs=attrs)
     part = slice(start, start + n) if some is None else slice(some[0], some[-1] + 1)
     rows: Any = item[part] if some is None else item[part][some - some[0]]
-    attrs = {"units": units} if units else {}
     if rows.ndim > 1:
         return ArrayOfEqualSizedArrays(nda=rows, attrs=attrs)
     if rows.dtype.kind == "O":

@@ -40,7 +40,8 @@ def read_hdf5(options: PulseFile) -> PulseSource:
         name = choose_waveforms(path, file, options.place)
         table, _, own_name = name.rpartition("/")
         group, values, times = file[table or "/"], file[name], dict[str, Column]()
-        columns, attrs = columns_of(path, group), h5.texts_of(file) | h5.texts_of(group)
+        columns = columns_of(path, group)
+        attrs = {n: h5.text_attribute(item, n) for item in (file, group) for n in item.attrs}
         if is_lh5 := isinstance(values, h5py.Group):
             times, values = columns_of(path, values), values["values"]
         else:

@@ -49,22 +49,17 @@ def read_arrays(path: Path) -> Arrays:
         ) from error
 
 
-def _of_array(
-    path: Path, format: str, name: str, values: npt.NDArray[Any], columns: dict[str, Column]
-) -> PulseSource:
-    (n, length), rows = values.shape, lambda start, stop: values[start:stop]
-    return PulseSource(path, format, name, n, length, rows, columns)
-
-
 def read_memory(options: PulseFile) -> PulseSource:
     """Pulses in memory."""
     pulses = options.pulses
     assert pulses is not None  # which are read in place of a file
     names = ("energy_kev", "event_number", "dt_ns")
     columns = {name: Column.of(np.asarray(getattr(pulses, name))) for name in names}
-    source = _of_array(options.path, "memory", "", pulses.waveforms, columns)
-    source.times["t0"] = Column.of(pulses.t0_ns, "ns")
-    return source
+    rows, times = pulses.waveforms, {"t0": Column.of(pulses.t0_ns, "ns")}
+    read = lambda start, stop: rows[start:stop]  # noqa: E731
+    return PulseSource(
+        options.path, "memory", "", len(rows), pulses.length, read, columns, times
+    )
 
 
 def read_numpy(options: PulseFile) -> PulseSource:
@@ -98,4 +93,6 @@ def read_numpy(options: PulseFile) -> PulseSource:
         for column, values in numbers.items()
         if values.ndim <= 1 or 1 in values.shape
     }
-    return _of_array(options.path, "NumPy", name, arrays[name], columns)
+    rows = arrays[name]
+    read = lambda start, stop: rows[start:stop]  # noqa: E731
+    return PulseSource(options.path, "NumPy", name, len(rows), rows.shape[1], read, columns)
