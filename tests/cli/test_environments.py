@@ -25,12 +25,6 @@ def python(*words: object, status: int = 0, **environment: str) -> str:
     return said
 
 
-@pytest.mark.parametrize("words", [["--help"], ["info", "--help"], ["info", "FILE"]])
-def test_without_docstrings(stand, words):
-    given = [str(stand.sim) if word == "FILE" else word for word in words]
-    assert "Traceback" not in python("-m", "cpunet", *given, PYTHONOPTIMIZE="2")
-
-
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
 def test_characters_that_a_terminal_lacks_are_replaced(stand, encoding):
     name = stand.folder / "caf\udce9.lh5"

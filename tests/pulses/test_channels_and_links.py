@@ -131,17 +131,6 @@ def test_each_link_reads_its_own_table(tmp_path, kind, inner):
         )
 
 
-@pytest.mark.parametrize("part", ["energy", "waveform/values"])
-def test_columns_that_are_links_to_other_files(tmp_path, part):
-    write(tmp_path / "one.lh5"), write(tmp_path / "two.lh5", traces=RAW + 1, kev=KEV + 1)
-    with h5py.File(tmp_path / "one.lh5", "a") as file:
-        del file[f"raw/{part}"]
-        file[f"raw/{part}"] = h5py.ExternalLink("two.lh5", f"raw/{part}")
-    pulses = open_pulses(tmp_path / "one.lh5").read()
-    np.testing.assert_array_equal(pulses.waveforms, RAW + (part != "energy"))
-    np.testing.assert_array_equal(pulses.energy_kev, KEV + (part == "energy"))
-
-
 @pytest.mark.parametrize(
     ("link", "said"),
     [

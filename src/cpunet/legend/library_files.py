@@ -32,14 +32,6 @@ ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
 ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
 
 
-def libraries_in(file: h5py.File) -> list[str]:
-    """Paths of the groups that hold templates."""
-    names: list[str] = []
-    file.visit(names.append)
-    arrays = (name.rpartition("/") for name in names if isinstance(file[name], h5py.Dataset))
-    return sorted({group for group, _, name in arrays if WAVEFORM.fullmatch(name)})
-
-
 def put(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
     """Store a number or an array with LH5 attributes, templates in chunks of a row of r."""
     values = np.asarray(values)

@@ -91,8 +91,6 @@ class PulseWriter:
     n_pulses: int = field(default=0, init=False)
 
     def __enter__(self) -> Self:
-        if not self.table.strip("/"):
-            raise CpunetError(f"{self.path}: the table has no name; give one such as geds/sim")
         refuse_existing(Path(self.path), force=self.force)
         self._stack = ExitStack()
         written = written_hdf5(Path(self.path))
