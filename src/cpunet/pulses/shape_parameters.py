@@ -278,15 +278,7 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
 def labelled(
     axis: hist.axis.Regular, parameter: str, bins: int | None = None
 ) -> hist.axis.Regular:
-    """The same range, in so many bins if given, with the parameter's name and label.
-
-    Raises
-    ------
-    CpunetError
-        If there are no so many bins.
-    """
-    if bins is not None and bins < 1:
-        raise CpunetError(f"`bins` is {bins}", "give 1 or more")
+    """The same range, in so many bins if given, with the parameter's name and label."""
     low, *_, high = axis.edges
     label = LABELLED[parameter].axis_label
     return hist.axis.Regular(bins or axis.size, low, high, name=parameter, label=label)
