@@ -47,10 +47,7 @@ def test_no_module_imports_from_a_later_room() -> None:
 
 def test_a_package_installed_over_this_one_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(cpunet, "__file__", str(tmp_path / "cpunet" / "__init__.py"))
-    information = tmp_path / "cpunet-1.0.0.dist-info"
-    information.mkdir()
-    (information / "METADATA").write_text("Name: cpunet\nVersion: 1.0.0\n")
-    (information / "RECORD").write_text("cpunet/__init__.py,,\ncpunet/model.py,,\n")
+    (tmp_path / "cpunet-1.0.0.dist-info").mkdir()
     cpunet.other_package.cache_clear()
     told = (
         "the package cpunet 1.0.0 is installed over cpunet-hpge, of the same import name; "

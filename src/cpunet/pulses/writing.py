@@ -114,8 +114,6 @@ class PulseWriter:
             Further values per event: name → (array of shape ``(n,)``, units), or an LH5 object
             of n rows.
         """
-        if len(pulses) == 0:
-            return
         n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
         settings = {"chunks": (n_rows, pulses.length), **_COMPRESSION}
         # not called "units": dspeed copies that attribute to its table buffer, which the LH5
