@@ -63,11 +63,6 @@ def test_rows_of_one_channel_are_chosen(tmp_path, columns, chosen, rows):
         open_pulses(path, table="channel=4")
 
 
-@pytest.mark.parametrize("name", ["energy_bin", "epoch", "batch"])
-def test_other_columns_of_few_values_do_not_part_rows(tmp_path, name):
-    assert open_pulses(write(tmp_path / "raw.lh5", **{name: HALF})).n_pulses == N
-
-
 def test_channels_that_are_text_and_arrays_of_numpy(tmp_path):
     names = np.array([b"V01", b"V02"])[PAIRS]
     with h5py.File(tmp_path / "raw.h5", "w") as file:

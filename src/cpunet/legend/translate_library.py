@@ -246,9 +246,9 @@ def chosen_libraries(
         If there is no library, a named one is missing, or none belongs to the detector of the
         run.
     """
-    found: list[str] = []
-    file.visit(found.append)
-    arrays = (name.rpartition("/") for name in found if isinstance(file[name], h5py.Dataset))
+    paths: list[str] = []
+    file.visit(paths.append)
+    arrays = (path.rpartition("/") for path in paths if isinstance(file[path], h5py.Dataset))
     names = sorted({group for group, _, name in arrays if WAVEFORM.fullmatch(name)})
     if not names:
         raise CpunetError(
