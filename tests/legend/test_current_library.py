@@ -188,6 +188,10 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
         ({"waveform_000_deg": Array(without(charge(), 2))}, "1 rows of 000_deg are NaN"),
         ({"waveform_045_deg": Array(without(charge(), np.s_[:]))}, "no template of 045_deg"),
         (
+            {"waveform_045_deg": Array(without(charge(), np.s_[2, 1, 2000:]))},
+            "1 templates hold NaN among their samples, the first at r 2, z 1 mm",
+        ),
+        (
             dict.fromkeys(WAVEFORMS, Array(np.diff(charge(), axis=2, prepend=0))),
             "these are currents",
         ),

@@ -356,8 +356,16 @@ def _write(
             within = currents[angle][inner], times[angle][inner]
             for rows in blocks(len(r_mm), ROWS):
                 charge = np.array(library[name][rows], np.float32)
-                # only zeros are no template, nor is what has a NaN
-                held = charge.any(axis=2) & ~np.isnan(charge).any(axis=2)
+                missing = np.isnan(charge)
+                part = np.argwhere(missing.any(axis=2) & ~missing.all(axis=2))
+                if len(part):
+                    r, z = r_mm[rows][part[0, 0]], z_mm[part[0, 1]]
+                    raise CpunetError(
+                        f"{where}: {len(part)} templates hold NaN among their samples, the "
+                        f"first at r {r:g}, z {z:g} mm of {name}; simulate the library again, "
+                        "with longer records if charge was late"
+                    )
+                held = charge.any(axis=2) & ~missing[:, :, 0]  # only zeros are no template
                 charge = charge[held]
                 within[0][rows][held], when = currents_about_peak(translate(charge))
                 within[1][rows][held] = when - delay_ns
