@@ -18,6 +18,7 @@ from cpunet.pulses.provenance import (
     recorded_side,
     require_side,
     rolled_over,
+    second_rate,
 )
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.reading.files import PulseFile
@@ -72,6 +73,19 @@ def test_energies_of_other_pulses_are_refused_unless_insisted(tmp_path, wrong):
     with pytest.raises(CpunetError, match=r"% of amplitudes and energies do not go together"):
         load_pulses(file, "measured", RECIPE, FEP)
     load_pulses(PulseFile(file.path, insist=True), "measured", RECIPE, FEP)
+
+
+@pytest.mark.parametrize("averaged", [2, 4])
+def test_a_second_rate_is_found_at_its_sample_and_told(tmp_path, caplog, averaged):
+    start = 1000
+    fine = traces(kev(), start + 500 * averaged)
+    coarse = fine[:, start:].reshape(N, 500, averaged).mean(axis=2)
+    both = np.rint(np.concatenate([fine[:, :start], coarse], axis=1)).astype(np.float32)
+    found = second_rate(both)
+    assert found == (pytest.approx(start, abs=8), pytest.approx(averaged, rel=0.1))
+    assert second_rate(fine[:, :1500].astype(np.float32)) is None
+    load_pulses(written(tmp_path / "two.lh5", both, kev()), "measured", RECIPE, FEP)
+    assert any("a second rate" in message for message in caplog.messages)
 
 
 @pytest.mark.parametrize("key", ["event_number", "timestamp"])

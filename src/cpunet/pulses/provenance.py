@@ -3,7 +3,7 @@
 What is in a file of pulses, in words: counts, energies, lines, traces.
 
 Signs that pulses are not what they are given as: the other side, counts that roll over,
-and energies of other events.
+energies of other events, and a second rate.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, line_slope
 from cpunet.pulses.parameters import tail_slope
 from cpunet.pulses.peaks import label_peaks, suggested_calibration
 from cpunet.pulses.reading.source import PulseSource, amplitude
@@ -322,6 +322,9 @@ FAR, ALIKE = 0.1, 0.1
 # Share of pulses whose amplitude and energy do not go together, from which they are refused,
 # and from which a warning says so.
 MAX_MISMATCHED, FEW_MISMATCHED = 0.2, 0.1
+# Samples over which noise is averaged, least part of the tail on either side of a change of
+# rate, and least factors by which noise and slope change there.
+SMOOTHED, MARGIN, MIN_NOISE, MIN_SLOPE = 64, 0.1, 1.2, 1.5
 # Counts that roll over: least period and number of traces, and share of the steep ones;
 # share of traces from which all are refused.
 LEAST_PERIOD, MIN_ROLLED, MOSTLY, MAX_ROLLED = 256, 3, 0.9, 0.2
@@ -384,8 +387,50 @@ def mismatched(kev: Values, amplitudes: Values) -> float:
     return far[1] if far[0] >= ALIKE else 0.0
 
 
+def second_rate(traces: FloatArray) -> tuple[int, float] | None:
+    """Find where digitisers begin to average samples, which are then longer.
+
+    Averages of m samples have less noise, by the root of m if it is white, and the decay goes
+    on m times as fast from sample to sample.
+
+    Parameters
+    ----------
+    traces
+        Raw traces, shape (pulses, samples).
+
+    Returns
+    -------
+    tuple or None
+        The sample at which they begin, and how many they average.
+    """
+    heights = amplitude(traces)
+    good = np.isfinite(heights) & (heights > 0)
+    if good.sum() < MIN_PULSES:
+        return None
+    heights, traces = heights[good, np.newaxis], traces[good]
+    start = int(np.median(traces.argmax(axis=1))) + SMOOTHED
+    tail: Values = traces[:, start:].astype(np.float64)
+    n = tail.shape[1]
+    margin = max(2 * SMOOTHED, round(MARGIN * n))
+    if n < 3 * margin:
+        return None
+    noise = np.log(np.median(np.abs(np.diff(tail, 2, axis=1)), axis=0) + 1e-9)  # (samples,)
+    places, sums = np.arange(margin, n - margin), np.append(0.0, np.cumsum(noise))
+    left, others = sums[places] / places, len(noise) - places
+    right = (sums[-1] - sums[places]) / others
+    best = int(((left - right) ** 2 * places * others).argmax())
+    at, lower = int(places[best]), float(np.exp(left[best] - right[best]))
+    baselines = traces.max(axis=1, keepdims=True) - heights
+    level = np.log(np.maximum(np.median((tail - baselines) / heights, axis=0), 1e-3))
+    before, after = (line_slope(len(part)) @ part for part in (level[:at], level[at:]))
+    faster = float(after / before) if before < 0 else 0.0
+    if lower < MIN_NOISE or faster < MIN_SLOPE:
+        return None
+    return start + at + 1, faster
+
+
 def require_sense(path: Path, traces: FloatArray, kev: Values, amplitudes: Values) -> None:
-    """Refuse counts that roll over, and energies of other pulses.
+    """Refuse counts that roll over, and energies of other pulses; warn of a second rate.
 
     Parameters
     ----------
@@ -411,3 +456,9 @@ def require_sense(path: Path, traces: FloatArray, kev: Values, amplitudes: Value
         )
     if share > FEW_MISMATCHED:
         log.warning(text)
+    if (begins := second_rate(traces)) is not None:
+        log.warning(
+            f"{path}: noise and slope of the tails change at sample {begins[0]}, as if "
+            f"{begins[1]:.0f} samples were averaged from there: a second rate; cut the traces "
+            "there, or resample them"
+        )
