@@ -84,12 +84,13 @@ def test_damaged_json(tmp_path: Path, text: str) -> None:
 
 
 NUMBERS = {
-    "4.4e3": 4400.0, "9e-1": 0.9, "1e-05": 1e-5, "-.5E+3": -500.0, "1.": 1.0, "1_000": 1000,
-    "true": True, "~": None, "'1e3'": "1e3", "1e": "1e",
+    "4.4e3": 4400.0, "9e-1": 0.9, "1e-05": 1e-5, "-.5E+3": -500.0, "1.": 1.0, "010": 10,
+    "0o10": 8, "0x1F": 31, "1_000": 1000, "true": True, "yes": "yes", "1:30": "1:30",
+    "2020-01-01": "2020-01-01", "~": None, "'1e3'": "1e3", "1e": "1e",
 }  # fmt: skip
 
 
-def test_numbers_with_exponents_come_back_as_written(tmp_path: Path) -> None:
+def test_scalars_are_those_of_yaml_1_2_and_come_back_as_written(tmp_path: Path) -> None:
     (tmp_path / "one.yaml").write_text("".join(f"k{i}: {n}\n" for i, n in enumerate(NUMBERS)))
     values = read_values(tmp_path / "one.yaml")
     assert [*values.values()] == [*NUMBERS.values()]

@@ -29,19 +29,35 @@ Fraction = Annotated[float, Field(ge=0, lt=1)]
 
 
 class _Loader(yaml.SafeLoader):
-    """Takes 4.4e3 and 1e-05 for numbers, as YAML 1.2 does."""
+    """YAML 1.2, in which 4.4e3 and 1e-05 are numbers, and 010 is ten."""
+
+    yaml_implicit_resolvers: ClassVar[Any] = {}  # type: ignore[misc]
 
 
 class _Dumper(yaml.SafeDumper):
-    """Quotes text that looks like such a number."""
+    """Quotes text that readers of YAML 1.1 or 1.2 would take for something else."""
 
 
-for _of in (_Loader, _Dumper):
-    _of.add_implicit_resolver(
-        "tag:yaml.org,2002:float",
-        re.compile(r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9_]*)?)[eE][-+]?[0-9]+$"),
+_CORE = {  # scalars of the core schema, with the characters that they begin with
+    "null": (r"~|null|Null|NULL|", ["~", "n", "N", ""]),
+    "bool": (r"true|True|TRUE|false|False|FALSE", [*"tTfF"]),
+    "int": (r"[-+]?[0-9][0-9_]*|0o[0-7]+|0x[0-9a-fA-F]+", [*"-+0123456789"]),
+    "float": (
+        r"[-+]?(\.[0-9]+|[0-9][0-9_]*(\.[0-9_]*)?)([eE][-+]?[0-9]+)?"
+        r"|[-+]?\.(inf|Inf|INF)|\.(nan|NaN|NAN)",
         [*"-+.0123456789"],
-    )
+    ),
+    "merge": ("<<", ["<"]),
+}
+for _tag, (_form, _first) in _CORE.items():
+    for _of in (_Loader, _Dumper):
+        _of.add_implicit_resolver(
+            f"tag:yaml.org,2002:{_tag}", re.compile(f"({_form})$"), _first
+        )
+_Loader.add_constructor(
+    "tag:yaml.org,2002:int",
+    lambda _, node: int(node.value, 0 if node.value[:2] in ("0o", "0x") else 10),
+)
 
 Set: TypeAlias = Mapping[str, Any] | Iterable[str]
 
