@@ -1,4 +1,4 @@
-"""What `info` says of files, detectors and folders."""
+"""What `info` says of files, detectors and folders, and what `load` opens."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import h5py
 import numpy as np
 import pytest
 
-from cpunet import CpunetError, FileOptions, PulseFile, info
+from cpunet import CpunetError, FileOptions, PulseFile, info, load
 from cpunet.electronics.pile_up_tails import PileUpTails
 from cpunet.pulses.baselines import Baselines
 from cpunet.pulses.container import Pulses
@@ -47,6 +47,15 @@ def test_a_file_of_pulses(tmp_path):
     }
 
 
+def test_a_file_is_opened(tmp_path):
+    path = tmp_path / "pulses.lh5"
+    write_pulses(path, Pulses.of(np.zeros((3, 20)), dt_ns=16))
+    assert load(path) == PulseFile(path)
+    (tmp_path / "text").write_text("no pulses")
+    with pytest.raises(CpunetError, match="text"):
+        load(tmp_path / "text")
+
+
 def test_tails_that_cannot_be_told(tmp_path):
     rng, path = np.random.default_rng(1), tmp_path / "pulses.lh5"
     write_pulses(path, Pulses.of(rng.integers(0, 900, (40, 400)), dt_ns=16))
@@ -62,6 +71,7 @@ def test_a_run_folder(tmp_path):
     lines = dict(info(tmp_path).lines)
     assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
+    assert load(tmp_path).summary() == info(tmp_path).lines
     assert lines["pile-up tails"] == "none significant"
 
 
@@ -199,18 +209,19 @@ def test_numbers_of_a_detector():
 
 def test_measured_traces_are_described(reference_data: Path):
     """A bench detector, whose properties are seen by eye."""
-    read = FileOptions(table="th228_fcio")
-    path = reference_data / "real" / "hpge_real_waveforms.h5"
-    told = dict(info(path, read=read, quality=True).lines)
+    told = dict(info(reference_data / "real" / "th228.fcio", quality=True).lines)
     assert float(told["decay"].removesuffix(" µs")) == pytest.approx(78.9, rel=0.03)
-    assert float(told["noise"].partition(" ADC, ")[0]) == pytest.approx(15, abs=2)
+    adc, _, words = told["noise"].partition(" ADC ")
+    assert float(adc) == pytest.approx(15, abs=2)
+    assert words == "(RMS of a baseline, median)"  # without energies not in keV
     assert told["left out"].startswith("2 saturated")
     assert told["left out"].endswith(" of 1000 traces")
 
 
 @pytest.mark.thorough
 def test_tails_of_a_bench_detector(reference_data: Path):
-    file = PulseFile(reference_data / "real" / "hpge_real_waveforms.h5", "th228_fcio")
+    path, calibrated = reference_data / "real" / "th228.fcio", 2614.5 / 40265
+    file = PulseFile(path, kev_per_adc=calibrated)
     tails = PileUpTails.of(Baselines.of(file.open().blocks(4096), RECIPE.preparation))
     assert tails.fit.recorded
     assert tails.decay_us == pytest.approx(85, rel=0.04)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -43,6 +44,10 @@ FILES: dict[str, tuple[Callable[[Path, Hostile], object], Callable[[Path], objec
     "pulses.npz": (arrays, open_pulses),
     "hits.npz": (arrays, read_hits),
     "pulses.npy": (lambda p, h: np.save(p, np.array([[h]], object)), open_pulses),
+    "pulses.pickle": (
+        lambda p, h: p.write_bytes(pickle.dumps({"wf": np.array([h], object)})),
+        open_pulses,
+    ),
     "weights.pt": (
         lambda p, h: torch.save({"inc": h}, p),
         lambda p: import_weights(p.parent / "run", ren=p),

@@ -190,8 +190,14 @@ def test_histograms_and_figures_of_translated_pulses(home, run):
         run.translate(home / "sim.lh5", adc=True).hist()
     axes = made.plot()  # for pyplot, unless one says where
     assert axes.figure is pyplot.gcf()
+    assert made.hist("drift_time", bins=50).plot(ax=axes) is axes
     assert len(made.hist("drift_time", bins=50).values()) == 50
+    counted = made.hist("drift_time").plot(color="red")
+    assert counted.figure is pyplot.gcf()
+    assert counted is not axes
     pyplot.close("all")
+    with pytest.raises(cpunet.CpunetError, match="`bins` is 0"):
+        made.hist(bins=0)
 
 
 def test_what_is_wrong_is_one_line(home, run):
@@ -260,16 +266,20 @@ def test_pulses_in_memory_do_what_files_do(home, tmp_path):
     assert (len(sim), len(sim[:7]), len(sim[sim.energy_kev > 0])) == (N, 7, N - 1)
     assert repr(data).startswith(f"<{N} pulses of 1200 samples, 16 ns each")
     assert list(sim.to_dataframe()) == ["event_number", "energy_kev", "peak"]
-    file = cpunet.PulseFile(sim.save(tmp_path / "sim.lh5"))
+    file = cpunet.load(sim.save(tmp_path / "sim.lh5"))
+    assert (file.waveforms.shape, file.energy_kev.shape) == (sim.waveforms.shape, (N,))
     assert repr(file) == f"<PulseFile {tmp_path / 'sim.lh5'}>"
-    np.testing.assert_array_equal(file.open().read().waveforms, sim.waveforms)
+    assert sum(map(len, file)) == N
+    for rows in (slice(3, 9), slice(-2, None), slice(None, None, -50), slice(9, 3)):
+        np.testing.assert_array_equal(file[rows].waveforms, sim[rows].waveforms)
+        np.testing.assert_array_equal(file[rows].event_number, sim[rows].event_number)
     assert "fast" in cpunet.list_recipes()
 
     assert cpunet.check(sim, data).ok
     run = cpunet.train(sim, data, recipe=load_recipe("fast", SHORT), device="cpu")
     assert run.folder is None
     saved = run.save(tmp_path / "run")
-    assert cpunet.Run.load(tmp_path / "run").fit == saved.fit
+    assert cpunet.load(tmp_path / "run").fit == saved.fit
 
     two = run.ren.translate(sim.waveforms[:2], noise=False)
     assert two.shape == (2, 800)

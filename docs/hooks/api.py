@@ -50,6 +50,8 @@ order in which data flow.
 
 ::: cpunet.info
 
+::: cpunet.load
+
 ::: cpunet.check
 
 ::: cpunet.response

@@ -8,6 +8,7 @@ from cpunet.electronics.stand import Stand as Stand
 from cpunet.electronics.stand import make_stand as make_stand
 from cpunet.errors import CpunetError as CpunetError
 from cpunet.inspection import info as info
+from cpunet.inspection import load as load
 from cpunet.legend.export import LegendParameters as LegendParameters
 from cpunet.legend.export import export_legend as export_legend
 from cpunet.legend.library_files import make_library as make_library

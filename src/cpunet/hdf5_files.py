@@ -60,19 +60,26 @@ def item_at(group: h5py.Group, path: str) -> h5py.Group | h5py.Dataset | None:
     Raises
     ------
     CpunetError
-        If it is a link that leads nowhere.
+        If a link on the way leads nowhere.
     """
-    if not path or (link := group.get(path, getlink=True)) is None:
-        return None if path else group
-    try:
-        return group[path]
-    except (KeyError, OSError, RuntimeError) as error:
-        to = ":".join(getattr(link, n) for n in ("filename", "path") if hasattr(link, n))
-        why = str(error).strip("'\"")
-        raise CpunetError(
-            f"{group.file.filename}: {path} cannot be opened: {to} ({why})",
-            "if it is a link, put its target in place, or choose another table",
-        ) from error
+    here = group
+    for part in filter(None, path.split("/")):
+        link = here.get(part, getlink=True) if isinstance(here, h5py.Group) else None
+        if link is None:
+            return None
+        try:
+            here = here[part]
+        except (KeyError, OSError, RuntimeError) as error:
+            if isinstance(link, h5py.HardLink):
+                raise
+            file = f"{link.filename}:" if isinstance(link, h5py.ExternalLink) else ""
+            why = str(error).strip("'\"").rpartition("(")[2].rstrip(")")
+            raise CpunetError(
+                f"{group.file.filename}: {part} is a link to {file}{link.path}, where nothing "
+                f"can be opened ({why})",
+                "put that in its place, or choose another table",
+            ) from error
+    return here
 
 
 def members(group: h5py.Group) -> dict[str, h5py.Group | h5py.Dataset]:

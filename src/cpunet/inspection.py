@@ -1,22 +1,29 @@
-"""Says what is in whatever this program reads or makes."""
+"""Opens whatever this program reads or makes, and says what is in it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
+from typing import TYPE_CHECKING, TypeAlias
 
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_picture, written_aside
 from cpunet.pulses import provenance
-from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_names
+from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, pulse_file, table_sizes
 from cpunet.recipes import load_recipe
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import Set, key_values
 from cpunet.simulation.geometry_readers import holds_detector, read_detector
 from cpunet.simulation.hit_files import describe_hits, holds_hits
 from cpunet.tables import Lines, aligned, text_table
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    Loaded: TypeAlias = cpunet.Run | cpunet.Report | cpunet.Stand | PulseFile
 
 _DPI = 150
 
@@ -38,12 +45,39 @@ class InfoResult:
     path: str
     lines: Lines
     ok: bool = True
+    _draw: Callable[[], Figure] | None = None
 
     def __str__(self) -> str:
         return aligned(self.lines)
 
     def __repr__(self) -> str:
         return f"<InfoResult {self.path}>"
+
+    def plot(self) -> Figure:
+        """Draw the fields of a detector.
+
+        Raises
+        ------
+        CpunetError
+            If it is none.
+        """
+        if self._draw is None:
+            raise CpunetError(f"{self.path}: is no detector to draw", "leave out `out`")
+        return self._draw()
+
+    def save(self, path: str | Path, force: bool = False) -> None:
+        """Write the figure as ``.png``, ``.pdf`` or ``.svg``.
+
+        Raises
+        ------
+        CpunetError
+            If the file exists and `force` is off, or there is no figure.
+        """
+        path = Path(path)
+        refuse_picture(path, self.path, force=force)
+        figure = self.plot()
+        with written_aside(path) as aside:
+            figure.savefig(aside, format=path.suffix[1:].lower(), dpi=_DPI)
 
 
 def info(
@@ -105,17 +139,24 @@ def info(
         detector = read_detector(path, values)
         fields = compute_fields(detector)
 
-        if out is not None:
+        def draw() -> Figure:
             from cpunet.simulation.detector_figure import detector_figure
 
-            figure = detector_figure(detector, fields)
-            with written_aside(Path(out)) as aside:
-                figure.savefig(aside, format=Path(out).suffix[1:].lower(), dpi=_DPI)
-        return InfoResult(str(path), fields_in_words(detector, fields))
+            return detector_figure(detector, fields)
+
+        of_detector = InfoResult(str(path), fields_in_words(detector, fields), _draw=draw)
+        if out is not None:
+            of_detector.save(out, force)
+        return of_detector
     if out is not None or values:
         raise CpunetError(f"{path}: is no detector", "leave out `settings` and `out`")
     if place.is_dir():
-        return InfoResult(str(path), _folder(place))
+        content = load(path)
+        if isinstance(content, cpunet.Run):
+            return InfoResult(str(path), content.summary())
+        verdicts = getattr(content, "verdicts", None)
+        lines = [("report", str(path)), *(("", verdict) for verdict in verdicts or ())]
+        return InfoResult(str(path), lines if verdicts else [("", str(content))])
     try:
         return _file(pulse_file(path, read), recipe, quality)
     except CpunetError:
@@ -127,17 +168,35 @@ def info(
     return InfoResult(str(path), lines)
 
 
-def _folder(folder: Path) -> Lines:
-    if (folder / "run.json").is_file():
-        return cpunet.Run.load(folder).summary()
-    if (folder / "metrics.json").is_file():
-        report = cpunet.Report.load(folder)
-        verdicts = [("", verdict) for verdict in report.verdicts]
-        return [("report", str(folder)), *verdicts] if verdicts else [("", str(report))]
-    if (folder / "stand.json").is_file():
-        return [("", str(cpunet.Stand.load(folder)))]
+def load(path: str | Path) -> Loaded:
+    """Open what this program reads or makes.
+
+    Parameters
+    ----------
+    path
+        Folder of a run, report or stand, or a file of pulses.
+
+    Returns
+    -------
+    Run, Report, Stand or PulseFile
+
+    Raises
+    ------
+    CpunetError
+        If it is none of these, or cannot be read.
+    """
+    path = Path(path)
+    if not path.is_dir():
+        file = PulseFile(path)
+        file.open()
+        return file
+    for name, kind in (
+        ("run.json", cpunet.Run), ("metrics.json", cpunet.Report), ("stand.json", cpunet.Stand),
+    ):  # fmt: skip
+        if (path / name).is_file():
+            return kind.load(path)
     raise CpunetError(
-        f"{folder}: no folder of this program",
+        f"{path}: no folder of this program",
         "give the folder of a run, which holds run.json, of a report or stand, or a file",
     )
 
@@ -158,14 +217,14 @@ def _file(file: PulseFile, recipe: Recipe, quality: bool) -> InfoResult:
     try:
         return InfoResult(path, _pulses(file, recipe, quality))
     except CpunetError:
-        tables = table_names(file.path) if file.table is None else []
+        tables = table_sizes(file.path) if file.table is None else {}
         if len(tables) < 2:
             raise
     rows: list[list[object]] = []
-    for name in tables:
+    for name, number in tables.items():
         try:
             with replace(file, table=name).open() as source:
-                numbers = [source.n_pulses, source.length, f"{source.dt_ns:g}"]
+                numbers = [number or source.n_pulses, source.length, f"{source.dt_ns:g}"]
                 rows.append([name, *numbers, source.energies])
         except CpunetError as error:
             rows.append([name, "", "", "", str(error).removeprefix(f"{path}: ")])

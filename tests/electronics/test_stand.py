@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from cpunet import Stand
+from cpunet import load
 from cpunet.electronics.chain import read_electronics
 from cpunet.electronics.stand import make_stand
 from cpunet.errors import CpunetError
@@ -44,8 +44,8 @@ def made(
     """Everything in the files of a stand but where and when it was made."""
     period = {"dt_ns": dt_ns}
     stand = make_stand(out, **SMALL, shift=shift, seed=seed, settings=period)
-    assert str(Stand.load(out)) == str(stand)
-    assert Stand.load(out).electronics == read_electronics("ornl", period)
+    assert str(load(out)) == str(stand)
+    assert load(out).electronics == read_electronics("ornl", period)
     assert tuple(sorted(path.name for path in out.iterdir())) == FILES
     content: dict[str, npt.NDArray[Any]] = {}
     for name in ("sim.lh5", "data.lh5"):

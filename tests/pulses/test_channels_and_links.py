@@ -14,7 +14,7 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.channels import channels_of
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading import open_pulses
-from cpunet.pulses.reading.files import PulseFile, table_names
+from cpunet.pulses.reading.files import PulseFile, table_sizes
 from cpunet.pulses.writing import other_columns
 from synthetic import one_line, waveform_table, write_table
 
@@ -45,7 +45,7 @@ HALF, PAIRS = np.tile([3, 7], N // 2), np.repeat([0, 1], N // 2)
 def test_rows_of_one_channel_are_chosen(tmp_path, columns, chosen, rows):
     path = write(tmp_path / "raw.lh5", **columns, baseline=np.arange(N))
     one_line(lambda: open_pulses(path), "channels or detectors", chosen.split(",")[0][:3])
-    assert f"raw/{chosen}" in table_names(path)
+    assert f"raw/{chosen}" in table_sizes(path)
     for table in (f"raw/{chosen}", chosen):
         source = open_pulses(path, table=table)
         pulses = source.read()
@@ -63,11 +63,16 @@ def test_rows_of_one_channel_are_chosen(tmp_path, columns, chosen, rows):
         open_pulses(path, table="channel=4")
 
 
+@pytest.mark.parametrize("name", ["energy_bin", "epoch", "batch"])
+def test_other_columns_of_few_values_do_not_part_rows(tmp_path, name):
+    assert open_pulses(write(tmp_path / "raw.lh5", **{name: HALF})).n_pulses == N
+
+
 def test_channels_that_are_text_and_arrays_of_numpy(tmp_path):
     names = np.array([b"V01", b"V02"])[PAIRS]
     with h5py.File(tmp_path / "raw.h5", "w") as file:
         file["waveform"], file["dt_ns"], file["detector"] = RAW, 16.0, names
-    assert table_names(tmp_path / "raw.h5") == ["detector=V01", "detector=V02"]
+    assert [*table_sizes(tmp_path / "raw.h5")] == ["detector=V01", "detector=V02"]
     assert open_pulses(tmp_path / "raw.h5", table="detector=V02").n_pulses == N // 2
     np.savez(tmp_path / "raw.npz", waveform=RAW, dt_ns=16.0, ch=HALF)
     one_line(lambda: open_pulses(tmp_path / "raw.npz"), "`table` ch=3")
@@ -115,7 +120,7 @@ def linked(folder: Path, kind: str, inner: str) -> Path:
 def test_each_link_reads_its_own_table(tmp_path, kind, inner):
     master = linked(tmp_path, kind, inner)
     if kind == "external":
-        assert table_names(master) == ["ch1/raw", "ch2/raw"]
+        assert [*table_sizes(master)] == ["ch1/raw", "ch2/raw"]
     for number, channel in enumerate(("ch1", "ch2")):
         source = open_pulses(master, table=f"{channel}/raw")
         np.testing.assert_array_equal(source.read().waveforms, RAW + number)
@@ -126,23 +131,42 @@ def test_each_link_reads_its_own_table(tmp_path, kind, inner):
         )
 
 
-@pytest.mark.parametrize(
-    ("link", "said"),
-    [
-        (h5py.ExternalLink("none.lh5", "ch/raw"), "none.lh5"),
-        (h5py.SoftLink("/none"), "not found"),
-    ],
-)
+@pytest.mark.parametrize("part", ["energy", "waveform/values"])
+def test_columns_that_are_links_to_other_files(tmp_path, part):
+    write(tmp_path / "one.lh5"), write(tmp_path / "two.lh5", traces=RAW + 1, kev=KEV + 1)
+    with h5py.File(tmp_path / "one.lh5", "a") as file:
+        del file[f"raw/{part}"]
+        file[f"raw/{part}"] = h5py.ExternalLink("two.lh5", f"raw/{part}")
+    pulses = open_pulses(tmp_path / "one.lh5").read()
+    np.testing.assert_array_equal(pulses.waveforms, RAW + (part != "energy"))
+    np.testing.assert_array_equal(pulses.energy_kev, KEV + (part == "energy"))
+
+
+BROKEN = {
+    "other file": h5py.ExternalLink("none.lh5", "ch/raw"),
+    "other table": h5py.ExternalLink("two.lh5", "none"),
+    "soft": h5py.SoftLink("/none"),
+    "loop": h5py.SoftLink("/raw/loop"),
+}
+
+
+@pytest.mark.parametrize("kind", BROKEN)
 @pytest.mark.parametrize("place", ["ch2", "ch2/raw", "raw/energy"])
-def test_a_broken_link_is_named(tmp_path, link, said, place):
-    path = write(tmp_path / "one.lh5")
-    with h5py.File(path, "a") as file:
+def test_a_broken_link_is_named_with_its_target(tmp_path, kind, place):
+    write(tmp_path / "two.lh5"), write(tmp_path / "one.lh5")
+    with h5py.File(tmp_path / "one.lh5", "a") as file:
         if place in file:
             del file[place]
-        file[place] = link
-    one_line(lambda: open_pulses(path), place.rpartition("/")[2], "cannot be opened", said)
+        file[place] = BROKEN[kind]
+        file["raw/loop"] = h5py.SoftLink("/raw/loop") if kind == "loop" else 1
+    said = ["is a link to", BROKEN[kind].path, place.rpartition("/")[2]]
+    one_line(lambda: open_pulses(tmp_path / "one.lh5"), *said)
     table = "raw" if place.startswith("raw") else place
-    one_line(lambda: open_pulses(path, table=table), "cannot be opened", said)
+    assert table in table_sizes(tmp_path / "one.lh5")
+    one_line(lambda: open_pulses(tmp_path / "one.lh5", table=table), *said)
+    if kind != "loop":
+        energy = f"{tmp_path}/one.lh5:{place}/energy".replace("energy/energy", "energy")
+        one_line(lambda: open_pulses(tmp_path / "two.lh5", energy=energy), *said)
 
 
 COMPOUND = np.zeros(N, [("energy", "f8"), ("waveform", "u2", (LENGTH,))])

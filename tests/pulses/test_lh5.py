@@ -142,6 +142,7 @@ def test_vectors_of_their_own_lengths(file, caplog):
         open_pulses(file, table="odd").read()
     source = open_pulses(file, table="ideal")
     np.testing.assert_array_equal(source.read().waveforms, [[1, 2, 3, 4]] * 4 + [[1, 2, 2, 2]])
+    np.testing.assert_array_equal(source.read(4, 5).waveforms, [[1, 2, 2, 2]])
     assert "pulses of 2 to 4 samples are continued" in caplog.text
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
-from cpunet.pulses.reading import open_pulses, table_names
+from cpunet.pulses.reading import open_pulses
 from synthetic import write_pulses
 
 VALUES = np.random.default_rng(2).normal(size=(11, 30)).astype(np.float32)
@@ -127,7 +127,7 @@ def test_what_is_missing_is_unknown_in_arrays_of_any_kind():
     np.testing.assert_array_equal(Pulses.of(jagged, dt_ns=16).waveforms, np.eye(3))
 
 
-@pytest.mark.parametrize("suffix", [".lh5", ".npz", ""])
+@pytest.mark.parametrize("suffix", [".lh5", ".fcio", ".npz", ""])
 @pytest.mark.parametrize(
     ("start", "words"),
     [
@@ -137,12 +137,7 @@ def test_what_is_missing_is_unknown_in_arrays_of_any_kind():
         (b"root\0\0", "is a ROOT file, which is not read; read its traces with uproot"),
         (b"\xe7\xca", "is a CAEN CoMPASS file, .*; convert it with legend-daq2lh5"),
         (b"\x1f\x8b\x08", "is a compressed file, which is not read; unpack it"),
-        (b"\x80\4", "is a pickled file, .*; load it with pickle if you trust it"),
         (b"MATLAB 5.0 MAT-file", "is a MATLAB 5 file, .*; save it with -v7.3"),
-        (
-            b"\xff\x35\x65\xc4FlashCamV1",
-            "is a FlashCam file, .*; convert it with legend-daq2lh5",
-        ),
     ],
 )
 def test_foreign_files_are_named_by_their_content(tmp_path, suffix, start, words):
@@ -190,27 +185,3 @@ def test_lh5_values_that_are_no_traces(tmp_path, shape):
         file[old].attrs.update(attributes)
     with pytest.raises(CpunetError, match=r"file.lh5: [^\n]*; [^\n]*$"):
         open_pulses(path)
-
-
-def test_the_layout_of_the_majorana_release(tmp_path):
-    """Datasets at the top of the file, as Table I of arXiv:2308.10856 has them."""
-    file, traces = tmp_path / "MJD_Train_0.hdf5", np.random.default_rng(7).normal(size=(6, 40))
-    with h5py.File(file, "w") as content:
-        content["raw_waveform"], content["energy_label"] = traces, 2614.511 + np.arange(6)
-        content["detector"], content["id"] = [5, 9, 5, 9, 5, 5], 10 * np.arange(6)
-        content["run_number"], content["psd_label_dcr"] = np.full(6, 60001), np.arange(6) % 2
-    assert table_names(file) == ["detector=5", "detector=9"]
-    with pytest.raises(CpunetError, match=r"2 channels or detectors .* `table` detector=5"):
-        open_pulses(file, dt_ns=10)
-    with pytest.raises(CpunetError, match="not in the file; give `dt_ns`"):
-        open_pulses(file, table="detector=5")
-    source = open_pulses(file, table="detector=9", dt_ns=10)
-    assert source.energies == "column energy_label [keV]"
-    np.testing.assert_array_equal(source.columns["id"].values, [10, 30])
-    np.testing.assert_array_equal(source.read().waveforms, traces[[1, 3]].astype(np.float32))
-    np.testing.assert_array_equal(source.read().energy_kev, 2614.511 + np.array([1, 3]))
-    source.close()
-    with h5py.File(file, "r+") as content:
-        del content["energy_label"]
-    source = open_pulses(file, table="detector=*", dt_ns=10)
-    assert (source.n_pulses, source.energies) == (6, "not known")

@@ -264,10 +264,10 @@ def test_the_default_recipe_beats_the_raw_simulation(reference_data: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_the_chain_runs_on_measured_traces(reference_data: Path, tmp_path: Path):
+def test_the_chain_runs_on_measured_flashcam_traces(reference_data: Path, tmp_path: Path):
     """Traces of a real detector, whose few events are taken from 300 keV on."""
     sim = PulseFile(reference_data / "closure" / "sim.lh5")
-    data = PulseFile(reference_data / "real" / "hpge_real_waveforms.h5", "th228_fcio")
+    data = PulseFile(reference_data / "real" / "th228.fcio", kev_per_adc=0.06493)
     # the simulation is of another detector, which no start of a fit would cure
     recipe = load_recipe("fast", ["training.start_factors=[1]"])
     made = train(sim, data, tmp_path / "run", recipe=recipe, peak="300-", device="cpu")

@@ -16,7 +16,7 @@ from cpunet.errors import CpunetError
 from cpunet.outputs import MARKER
 from cpunet.processes import outcomes, usable_cores
 from cpunet.progress import stage
-from cpunet.pulses.reading.files import ALL, PulseFile, table_names
+from cpunet.pulses.reading.files import ALL, PulseFile, table_sizes
 from cpunet.tables import aligned
 
 log = logging.getLogger(__name__)
@@ -63,7 +63,7 @@ def channels_of(file: PulseFile) -> dict[str, PulseFile]:
     CpunetError
         If the file cannot be read, or its format has no tables.
     """
-    tables = table_names(file.path)
+    tables = [*table_sizes(file.path)]
     if not tables:
         raise CpunetError(
             f"{file.path}: holds no tables of waveforms of which to take all; leave out "

@@ -11,6 +11,8 @@ a channel; pulses that do not decay are not corrected.  The height is that of a 
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, Any
+
 import hist
 import numpy as np
 
@@ -27,6 +29,10 @@ from cpunet.pulses.parameters import (
     tail_slope,
 )
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
 
 # Rise and flat top of the trapezoid, and times over which charge is compared with that later.
 TRAP_NS, LATE_NS, EFFECTIVE_NS = 2000.0, 2000.0, 3000.0
@@ -278,7 +284,43 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
 def labelled(
     axis: hist.axis.Regular, parameter: str, bins: int | None = None
 ) -> hist.axis.Regular:
-    """The same range, in so many bins if given, with the parameter's name and label."""
+    """The same range, in so many bins if given, with the parameter's name and label.
+
+    Raises
+    ------
+    CpunetError
+        If there are no so many bins.
+    """
+    if bins is not None and bins < 1:
+        raise CpunetError(f"`bins` is {bins}", "give 1 or more")
     low, *_, high = axis.edges
     label = LABELLED[parameter].axis_label
     return hist.axis.Regular(bins or axis.size, low, high, name=parameter, label=label)
+
+
+class Histogram(hist.Hist[Any], family=hist):
+    """A `hist.Hist` that is drawn without further packages."""
+
+    def plot(self, ax: Axes | None = None, **how: Any) -> Axes:  # type: ignore[override]
+        """Draw the counts of one axis, of each category of an axis before it.
+
+        Parameters
+        ----------
+        ax
+            Where to draw; a new figure of pyplot by default.
+        how
+            Further arguments of `matplotlib.axes.Axes.stairs`.
+        """
+        from cpunet.plotting import label, own_axes
+
+        *categories, axis = self.axes
+        ax = own_axes(ax)
+        names = list(categories[0]) if categories else []
+        for name in names or [None]:
+            counts: Any = self if name is None else self[name, :]
+            text = {} if name is None else {"label": label(name)}
+            ax.stairs(counts.values(), axis.edges, **text | how)
+        ax.set(xlabel=axis.label, ylabel="Counts")
+        if names:
+            ax.legend()
+        return ax

@@ -233,11 +233,11 @@ def other_columns(source: PulseSource, own: Collection[str]) -> tuple[Read, dict
         The reason for each column that cannot be copied.
     """
     readers, left_out = dict[str, Callable[[int, int], LGDO]](), dict[str, str]()
-    chosen, n_rows = source.chosen, source.n_all or source.n_pulses
+    chosen, n_rows = source.chosen, source.n_all or source.n_pulses or 0
     with one_line(source.path):
         if source.group is None:
             columns = {name: (c.values, c.units) for name, c in source.columns.items()}
-            chosen, n_rows = None, source.n_pulses
+            chosen, n_rows = None, source.n_pulses or 0
         else:
             waveforms = source.name.rpartition("/")[2]
             items = members(source.group)

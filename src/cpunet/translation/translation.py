@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
-from hist import Hist
 
 from cpunet.errors import CpunetError, named
 from cpunet.plotting import COLOURS, own_axes, styled
@@ -20,6 +19,7 @@ from cpunet.pulses.preparation import Codes, Rejection
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.shape_parameters import (
     MAX_BINS,
+    Histogram,
     all_parameters,
     data_axis,
     labelled,
@@ -134,7 +134,7 @@ class Translation:
             )
         return all_parameters(self.pulses, self.recipe.preparation, self.recipe.scores)
 
-    def hist(self, parameter: str = "current_amplitude", bins: int | None = None) -> Hist[Any]:
+    def hist(self, parameter: str = "current_amplitude", bins: int | None = None) -> Histogram:
         """Distribution of a parameter as a `hist.Hist`, in so many bins if given.
 
         Raises
@@ -143,7 +143,7 @@ class Translation:
             If there is no such parameter.
         """
         values = named(self.parameters, parameter, "parameter")
-        histogram = Hist[Any](labelled(data_axis(values, MAX_BINS), parameter, bins))
+        histogram = Histogram(labelled(data_axis(values, MAX_BINS), parameter, bins))
         histogram.fill(values[np.isfinite(values)])
         return histogram
 

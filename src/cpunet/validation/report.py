@@ -30,10 +30,11 @@ from cpunet.tables import number, text_table, with_std
 from cpunet.validation.metrics import Metrics, called
 
 if TYPE_CHECKING:
-    from hist import Hist
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+    from cpunet.pulses.shape_parameters import Histogram
 
 METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
 REPORT = FolderKind(
@@ -184,7 +185,7 @@ class Report:
 
     def hist(
         self, peak: str, parameter: str = "current_amplitude", bins: int | None = None
-    ) -> Hist[Any]:
+    ) -> Histogram:
         """Distributions of a parameter by method, in the range in which it is scored.
 
         Parameters
@@ -196,8 +197,8 @@ class Report:
 
         Returns
         -------
-        hist.Hist
-            A histogram with the axes ``method`` (categories) and the parameter.
+        Histogram
+            A `hist.Hist` with the axes ``method`` (categories) and the parameter.
 
         Raises
         ------
@@ -206,7 +207,7 @@ class Report:
         """
         import hist
 
-        from cpunet.pulses.shape_parameters import labelled
+        from cpunet.pulses.shape_parameters import Histogram, labelled
 
         of_peak = named(self.values, peak, "scored peak")
         named(of_peak["data"], parameter, "parameter")
@@ -214,7 +215,7 @@ class Report:
         binning = (scores.parameters | scores.further)[parameter].axis
         axis = hist.axis.Regular(binning.bins or 1, binning.low or 0.0, binning.high or 1.0)
         axis = labelled(axis, parameter, bins)
-        made = hist.Hist[Any](hist.axis.StrCategory(list(of_peak), name="method"), axis)
+        made = Histogram(hist.axis.StrCategory(list(of_peak), name="method"), axis)
         for method, values in of_peak.items():
             made.fill(method, values[parameter][np.isfinite(values[parameter])])
         return made

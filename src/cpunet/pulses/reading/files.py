@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias
 
 import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.tables import shortened
 
 if TYPE_CHECKING:
     from cpunet.pulses.reading.source import PulseSource
@@ -125,6 +128,38 @@ class PulseFile:
         options = "".join(f", {name} {value}" for name, value in self.options.items())
         return f"<PulseFile {self.path}{options}>"
 
+    def __bool__(self) -> bool:
+        return True  # without a look at the file
+
+    def __len__(self) -> int:
+        with self.open() as source:
+            return source.n_pulses or sum(map(len, source.blocks()))
+
+    def __iter__(self) -> Iterator[Pulses]:
+        """Blocks of a few thousand pulses."""
+        with self.open() as source:
+            yield from source.blocks()
+
+    def __getitem__(self, rows: slice) -> Pulses:
+        """The pulses of some rows; others are not read, where the format allows it."""
+        with self.open() as source:
+            if (n := source.n_pulses) is None:
+                return source.read()[rows]
+            if not (picked := range(n)[rows]):
+                return source.read(0, 1)[:0]
+            first, last = sorted((picked[0], picked[-1]))
+            return source.read(first, last + 1)[:: picked.step]
+
+    @property
+    def waveforms(self) -> FloatArray:
+        """Waveforms of all pulses, shape ``(n, samples)``, read on every access."""
+        return self[:].waveforms
+
+    @property
+    def energy_kev(self) -> npt.NDArray[np.float64]:
+        """Energies of all pulses in keV, read on every access."""
+        return self[:].energy_kev
+
     @property
     def files(self) -> tuple[Path | str | None, ...]:
         """Paths that are read, for `cpunet.outputs.refuse_inputs`."""
@@ -136,16 +171,42 @@ class PulseFile:
         given = {name: getattr(self, name) for name in _OPTIONS}
         return {name: value for name, value in given.items() if value is not None}
 
+    def chosen_of(self, tables: list[str], kind: str, kinds: str) -> str:
+        """The table that the user chose, or the only table.
+
+        Parameters
+        ----------
+        tables
+            Tables in the file, at least one.
+        kind, kinds
+            What a table and several are called.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such table, or there are several and none was chosen.
+        """
+        place = tables[0] if self.place is None and len(tables) == 1 else self.place
+        if place in tables:
+            return place
+        if place is not None:
+            raise CpunetError(f"{self.path}: no {kind} {place}; there are {shortened(tables)}")
+        raise CpunetError(
+            f"{self.path}: {len(tables)} {kinds} ({shortened(tables)})",
+            "choose one with `table` (`sim_table`, `data_table`)",
+        )
+
     def open(self) -> PulseSource:
         """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""
         # HDF5 takes a fifth of a second to import
-        if self.pulses is None and recognise(self.path) == "HDF5":
+        format_ = "memory" if self.pulses is not None else recognise(self.path)
+        if format_ == "HDF5":
             from cpunet.pulses.reading.hdf5 import read_hdf5
 
             return read_hdf5(self).resolve(self)
-        from cpunet.pulses.reading.other_formats import read_memory, read_numpy
+        from cpunet.pulses.reading.other_formats import READERS
 
-        return (read_memory if self.pulses is not None else read_numpy)(self).resolve(self)
+        return READERS[format_](self).resolve(self)
 
 
 Source: TypeAlias = str | Path | PulseFile | Pulses
@@ -179,15 +240,12 @@ def pulse_file(
 # First bytes of each format
 _FORMATS = {
     "HDF5": rb"(.{512})?\x89HDF\r\n\x1a\n",  # MATLAB writes 512 bytes of its own before it
+    "FlashCam": rb".{4}FlashCam",
     "NumPy": rb"\x93NUMPY|PK\x03\x04",
+    "pickle": rb"\x80[\2-\5]",
 }
 _AS_NPZ = "numpy.savez(FILE, waveform=…, energy_kev=…, dt_ns=…)"
 _FOREIGN = {  # what cannot be read, and what to do
-    rb"\x80[\2-\5]": (
-        "pickled",
-        f"load it with pickle if you trust it, and {_AS_NPZ}",
-    ),
-    rb".{4}FlashCam": ("FlashCam", "convert it with legend-daq2lh5"),
     rb"root": ("ROOT", f"read its traces with uproot, write them with {_AS_NPZ}"),
     rb"MATLAB 5\.0": ("MATLAB 5", "save it with -v7.3"),
     rb"PAR1": ("Parquet", f"write it with {_AS_NPZ}"),
@@ -207,8 +265,8 @@ def open_pulses(
 ) -> PulseSource:
     """Open a file of pulses; the format is recognised by its content.
 
-    Supported formats are LH5 (waveform tables, plain or encoded) and other HDF5, and NumPy's
-    ``.npz`` and ``.npy``.
+    Supported formats are LH5 (waveform tables, plain or encoded) and other HDF5, FlashCam
+    ``.fcio``, NumPy ``.npz`` and ``.npy``, and CPU-Net's pickled pulses.
 
     Parameters
     ----------
@@ -216,9 +274,9 @@ def open_pulses(
         The file.
     table
         Location of the waveforms, needed only if there are several: a table or waveform
-        column of an LH5 file, a group or dataset of an HDF5 file, an array of an ``.npz``.
-        Rows of a table that holds several channels are chosen by a column, as
-        ``raw/channel=3``.
+        column of an LH5 file, a group or dataset of an HDF5 file, an array of an ``.npz``, a
+        channel of an ``.fcio``.  Rows of a table that holds several channels are chosen by a
+        column, as ``raw/channel=3``.
     energy
         Column of the energies, or ``FILE:path/to/column`` for a column of another
         HDF5 file of the same events, such as LEGEND's hit tier.
@@ -242,8 +300,15 @@ def open_pulses(
     return PulseFile(Path(path), table, energy, kev_per_adc, dt_ns).open()
 
 
-def table_names(path: str | Path) -> list[str]:
+def table_sizes(path: str | Path) -> dict[str, int | None]:
     """Waveform tables of an LH5 or other HDF5 file; none of formats without tables.
+
+    For FlashCam files these are the channels with traces.
+
+    Returns
+    -------
+    dict
+        Number of pulses of each if it had to be counted, else None.
 
     Raises
     ------
@@ -251,11 +316,15 @@ def table_names(path: str | Path) -> list[str]:
         If the file is missing or cannot be read.
     """
     path = Path(path)
-    if recognise(path) != "HDF5":
-        return []
+    if (format_ := recognise(path)) == "FlashCam":
+        from cpunet.pulses.reading.other_formats import channel_sizes
+
+        return channel_sizes(path)
+    if format_ != "HDF5":
+        return {}
     from cpunet.pulses.reading.hdf5 import channel_tables
 
-    return channel_tables(path)
+    return dict.fromkeys(channel_tables(path))
 
 
 def recognise(path: Path) -> str:
@@ -277,10 +346,16 @@ def recognise(path: Path) -> str:
         raise CpunetError(f"{path}: cannot be read ({error.strerror}); check it") from error
     if not head:
         raise CpunetError(f"{path}: is empty; copy or write it again")
+    # the FCIO library unpacks these two itself, by their suffix
+    if path.name.endswith((".fcio.gz", ".fcio.zst")):
+        return "FlashCam"
     for name, start in _FORMATS.items():
         if re.match(start, head, re.DOTALL):
             return name
     for start, (program, remedy) in _FOREIGN.items():
-        if re.match(start, head, re.DOTALL):
+        if re.match(start, head):
             raise CpunetError(f"{path}: is a {program} file, which is not read", remedy)
-    raise CpunetError(f"{path}: of no known format; give LH5, HDF5, or NumPy .npz or .npy")
+    raise CpunetError(
+        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, or "
+        "pickled pulses"
+    )

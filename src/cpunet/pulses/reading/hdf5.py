@@ -27,7 +27,7 @@ from cpunet.tables import shortened
 _PREFERRED = ("waveform", "waveform_windowed")
 log = logging.getLogger(__name__)
 
-_Folder = tuple[str, dict[str, h5py.Group | h5py.Dataset], list[str]]
+_Folder = tuple[str, dict[str, h5py.Group | h5py.Dataset], list[str], list[str]]
 
 # plain datasets, in order of preference
 _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
@@ -118,8 +118,11 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
         raise CpunetError(f"{path}: no table {place}; there are {shortened(tables)}")
     if _is_lh5(item) or _is_array(item):
         return place
-    folders = _folders(item, place) if isinstance(item, h5py.Group) else ()
-    columns = [column for *_, waveforms in folders for column in waveforms]
+    folders = [*_folders(item, place)] if isinstance(item, h5py.Group) else []
+    for *_, broken in folders:
+        for link in broken:
+            h5.item_at(file, link)  # which says what is wrong
+    columns = [column for _, _, waveforms, _ in folders for column in waveforms]
     if len(columns) == 1:
         return columns[0]
     if not columns:
@@ -144,7 +147,7 @@ def _no_waveforms(path: Path, file: h5py.File, place: str) -> CpunetError:
     if place and (tables := waveform_tables(file)):
         return CpunetError(f"{path}: no waveforms in {place}; they are in {shortened(tables)}")
     held: dict[str, int] = {}
-    for folder, items, _ in _folders(file):
+    for folder, items, _, _ in _folders(file):
         for name, item in items.items():
             if isinstance(item, h5py.Dataset) and item.shape:
                 what = h5py.check_vlen_dtype(item.dtype) or item.dtype
@@ -163,8 +166,11 @@ def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
 
 
 def waveform_tables(file: h5py.File) -> list[str]:
-    """Paths of the tables that contain waveforms, sorted."""
-    return sorted({path for path, _, waveforms in _folders(file) if waveforms})
+    """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
+    folders = [
+        (broken, [path] if waveforms else []) for path, _, waveforms, broken in _folders(file)
+    ]
+    return sorted({path for broken, table in folders for path in broken or table})
 
 
 def channel_tables(path: Path) -> list[str]:
@@ -172,7 +178,10 @@ def channel_tables(path: Path) -> list[str]:
     channels: list[str] = []
     with h5.opened(path) as file:
         for table in waveform_tables(file):
-            columns = columns_of(path, file[table or "/"])
+            try:
+                columns = columns_of(path, h5.item_at(file, table))
+            except CpunetError:  # said where the table is opened
+                columns = {}
             n = max((column.size for column in columns.values()), default=0)
             whole = {name: column for name, column in columns.items() if column.size == n}
             names = parts(whole, np.arange(n))[1] or [""]
@@ -185,22 +194,28 @@ def _folders(
 ) -> Iterator[_Folder]:
     """A group and those in it, except in tables, through links.
 
-    Of each: its path, what it holds, and paths of waveforms in it: those of LH5, or else the
-    first of the usual names.
+    Of each: its path, what it holds, paths of waveforms in it, and of links that lead nowhere.
+    The waveforms are those of LH5, or else the first of the usual names.
     """
     # links can give an object several names or form cycles: visit each object once
     seen, info = set() if seen is None else seen, h5py.h5o.get_info(group.id)
     if (info.fileno, info.addr) in seen:
         return
     seen.add((info.fileno, info.addr))
-    items = h5.members(group)
+    items, broken = dict[str, h5py.Group | h5py.Dataset](), list[str]()
+    for name in group:
+        try:
+            items[name] = h5.item_at(group, name)
+        except CpunetError:
+            broken.append(name)
     is_table = h5.text_attribute(group, "datatype").startswith("table")
     names = [name for name, item in items.items() if _is_lh5(item)]
     names = names or [name for name in _PLAIN if _is_array(items.get(name))][:1]
     if is_table and {"dt", "values"} <= items.keys():
         names = []  # the inside of waveforms
     of = f"{path}/".lstrip("/")
-    yield path, items, [of + name for name in names]
+    lost = [] if names or is_table else [of + name for name in broken]
+    yield path, items, [of + name for name in names], lost
     for name, item in items.items():
         # columns of a table can be groups of many datasets, but contain no waveforms
         if isinstance(item, h5py.Group) and not is_table:

@@ -212,8 +212,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
 
     The reader of a format gives the content, and `resolve` the sampling period and the
     energies.  The file is closed at the end of a ``with``, or with the last reference to this.
-    The memory in use does not grow with the traces of a file, except for ``.npz``, which is
-    read as a whole.
+    The memory in use does not grow with the traces of a file, except for ``.npz`` and pickles,
+    which are read as a whole.
 
     Parameters
     ----------
@@ -222,7 +222,7 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     name
         Location of the traces in the file.
     n_pulses
-        Number of traces.
+        Number of traces; None if it is unknown without reading the whole file.
     length
         Samples per trace.
     rows
@@ -234,14 +234,14 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         Sampling periods ``dt`` and times of the first samples ``t0`` that are no columns.
     attrs
         What the file says about the traces: side, maker, detector.
+    of_each
+        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
+        ``t0_ns``, and ``dt_ns`` if there are several.
     group, close
         Group of an HDF5 file with columns of any kind; closes the file.
 
     Attributes
     ----------
-    of_each
-        Values of each trace, as far as the file has them: ``energy_kev``, ``event_number``,
-        ``t0_ns``, and ``dt_ns`` if there are several.
     chosen, n_all
         Rows of the table that are read, and how many it has; None if all are.
     dt_ns
@@ -255,15 +255,15 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     path: Path
     format: str
     name: str
-    n_pulses: int
+    n_pulses: int | None
     length: int
     rows: Read
     columns: dict[str, Column] = field(default_factory=dict)
     times: dict[str, Column] = field(default_factory=dict)
     attrs: Mapping[str, str] = field(default_factory=dict)
+    of_each: dict[str, Any] = field(default_factory=dict)
     group: h5py.Group | None = None
     close: Callable[[], None] = lambda: None
-    of_each: dict[str, Any] = field(default_factory=dict, init=False)
     chosen: npt.NDArray[np.int64] | None = field(default=None, init=False)
     n_all: int | None = field(default=None, init=False)
     dt_ns: float = field(default=np.nan, init=False)
@@ -290,12 +290,13 @@ class PulseSource(AbstractContextManager["PulseSource"]):
                 f"{self.length}: their dimensions are reversed",
                 "write them transposed, with the pulses first",
             )
-        self._choose(file.rows, n)
+        if n is not None:
+            self._choose(file.rows, n)
         self._sample(file.dt_ns)
         self._calibrate(file.energy, file.kev_per_adc)
         t0 = self.times.get("t0")
         if t0 is not None and (by := factor(t0.units, "ns")) is not None:
-            self.of_each["t0_ns"] = np.broadcast_to(by * t0.values, (self.n_pulses,))
+            self.of_each["t0_ns"] = np.broadcast_to(by * t0.values, (self.n_pulses or 0,))
         if name := next((name for name in EVENT_KEYS[:-1] if name in self.columns), None):
             self.of_each["event_number"] = self._of_each(name, self.columns[name])
         return self
@@ -303,12 +304,12 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     def _of_each(self, name: str, column: Column) -> Values:
         """Values of a column, which must be as many as there are traces, or one for all."""
         values, n = column.values, self.n_pulses
-        if values.shape not in ((), (n,)):
+        if n is not None and values.shape not in ((), (n,)):
             raise CpunetError(
                 f"{self.path}: column {name} has {len(values)} values for {n} waveforms; "
                 "give the column of the same events"
             )
-        return np.broadcast_to(values, (n,))
+        return np.atleast_1d(values) if n is None else np.broadcast_to(values, (n,))
 
     def _choose(self, wanted: Mapping[str, str], n: int) -> None:
         """Choose rows by values of some columns; all must be of one channel."""
@@ -438,14 +439,26 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         Raises
         ------
         CpunetError
-            If the file is damaged, or if its events differ in length or sampling period.
+            If the file is damaged or contains no pulses, or if its events differ in length or
+            sampling period.
         """
-        size = min(size, max(1, BLOCK_BYTES // (4 * self.length)))
-        return (self._pulses(start, start + size) for start in range(0, self.n_pulses, size))
+        size, start = min(size, max(1, BLOCK_BYTES // (4 * self.length))), 0
+        while start != self.n_pulses and len(pulses := self._pulses(start, start + size)):
+            yield pulses
+            start += len(pulses)
+        if start == 0:
+            raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
+        if (energies := len(self.of_each.get("energy_kev", range(start)))) != start:
+            raise CpunetError(
+                f"{self.path}: {start} waveforms, but {energies} energies; "
+                "give the energies of the same events"
+            )
 
-    def read(self) -> Pulses:
-        """Read all pulses of the file at once; they must fit in memory."""
-        return Pulses.concatenate(list(self.blocks()))
+    def read(self, start: int = 0, stop: int | None = None) -> Pulses:
+        """Read all pulses of the file, or some rows, at once; they must fit in memory."""
+        if stop is None:
+            return Pulses.concatenate(list(self.blocks()))
+        return self._pulses(start, stop)
 
     def _pulses(self, start: int, stop: int) -> Pulses:
         """Traces of some rows with their energies, numbers and times."""
@@ -457,6 +470,11 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         energy_kev = of_each.get("energy_kev")
         if energy_kev is None and self.kev_per_adc is not None:
             energy_kev = self.kev_per_adc * amplitude(waveforms)
+        if energy_kev is not None and len(energy_kev) != n:
+            raise CpunetError(
+                f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
+                "give the energies of the same events"
+            )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
         periods = of_each.get("dt_ns", np.full(n, self.dt_ns))
         other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
