@@ -26,18 +26,14 @@ def log(monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture):
     return caplog
 
 
-def test_a_bar_of_a_terminal() -> None:
+def test_messages_do_not_tear_a_bar_of_a_terminal() -> None:
     with redirect_stderr(Terminal()) as terminal, stage("Reading [a]", 2) as bar:
-        bar.update(2)
-    assert "Reading [a]: 100%" in terminal.getvalue()
-    assert "2/2" in terminal.getvalue()
-
-
-def test_messages_do_not_tear_a_bar() -> None:
-    with redirect_stderr(Terminal()) as terminal, stage("Reading", 2) as bar:
         bar.update()
         logging.getLogger("cpunet.somewhere").warning("few pulses")
+        bar.update()
     assert "\rfew pulses\n\rReading" in terminal.getvalue()
+    assert "Reading [a]: 100%" in terminal.getvalue()
+    assert "2/2" in terminal.getvalue()
 
 
 def test_a_log_has_lines_with_the_time_left(log: pytest.LogCaptureFixture) -> None:

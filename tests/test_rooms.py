@@ -45,32 +45,20 @@ def test_no_module_imports_from_a_later_room() -> None:
     assert not wrong
 
 
-@pytest.fixture
-def installed(monkeypatch, tmp_path):
-    """Pretend that this package lies in a folder, with another distribution beside it."""
+def test_a_package_installed_over_this_one_is_named(monkeypatch, tmp_path):
     monkeypatch.setattr(cpunet, "__file__", str(tmp_path / "cpunet" / "__init__.py"))
-
-    def install(*files: str) -> None:
-        information = tmp_path / "cpunet-1.0.0.dist-info"
-        information.mkdir()
-        (information / "METADATA").write_text("Name: cpunet\nVersion: 1.0.0\n")
-        (information / "RECORD").write_text("".join(f"{file},,\n" for file in files))
-        cpunet.other_package.cache_clear()
-
+    (tmp_path / "cpunet-1.0.0.dist-info").mkdir()
     cpunet.other_package.cache_clear()
-    yield install
-    cpunet.other_package.cache_clear()
-
-
-def test_over_this_one(installed):
-    installed("cpunet/__init__.py", "cpunet/model.py")
     told = (
         "the package cpunet 1.0.0 is installed over cpunet-hpge, of the same import name; "
         "pip uninstall cpunet cpunet-hpge, then install the one you want"
     )
-    assert cpunet.other_package() == told
-    with pytest.warns(UserWarning, match="installed over cpunet-hpge"):
-        assert cpunet.Pulses
+    try:
+        assert cpunet.other_package() == told
+        with pytest.warns(UserWarning, match="installed over cpunet-hpge"):
+            assert cpunet.Pulses
+    finally:
+        cpunet.other_package.cache_clear()
 
 
 def test_the_lock_holds_what_the_constraints_say():

@@ -28,7 +28,7 @@ SEARCHED_LAST = "---\nsearch: {boost: 0.2}\n---\n"
 NAMES = """
 train translate validate compare calibrate simulate Simulation make_stand Stand info load
 check response demo tune list_recipes import_weights export_onnx export_legend make_library
-translate_library merge_libraries LegendParameters Adc Run Translation Report Comparison
+translate_library LegendParameters Adc Run Translation Report Comparison
 Calibration Plan PulseFile HitFile FileOptions HitOptions ReadOptions CpunetError
 open_pulses Pulses REN IREN
 """

@@ -40,16 +40,10 @@ def other_package() -> str | None:
     metadata = next(here.parent.glob(f"{OTHER}-*.dist-info"), None)
     if metadata is None:
         return None
-    # Imported only here, since it would make `cpunet --help` wait for tens of milliseconds
-    from importlib.metadata import Distribution
-
-    other = Distribution.at(metadata)
-    files = (Path(str(other.locate_file(file))) for file in other.files or ())
-    if not any(here == file.parent.resolve() for file in files if file.suffix == ".py"):
-        return None
+    package = metadata.stem.replace("-", " ")  # with its version
     return (
-        f"the package {OTHER} {other.version} is installed over {DISTRIBUTION}, of the same "
-        f"import name; pip uninstall {OTHER} {DISTRIBUTION}, then install the one you want"
+        f"the package {package} is installed over {DISTRIBUTION}, of the same import name; "
+        f"pip uninstall {OTHER} {DISTRIBUTION}, then install the one you want"
     )
 
 

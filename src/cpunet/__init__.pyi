@@ -12,7 +12,6 @@ from cpunet.inspection import load as load
 from cpunet.legend.export import LegendParameters as LegendParameters
 from cpunet.legend.export import export_legend as export_legend
 from cpunet.legend.library_files import make_library as make_library
-from cpunet.legend.library_files import merge_libraries as merge_libraries
 from cpunet.legend.translate_library import translate_library as translate_library
 from cpunet.pulses.container import Pulses as Pulses
 from cpunet.pulses.reading import open_pulses as open_pulses

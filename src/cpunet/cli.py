@@ -142,8 +142,14 @@ def run(words: Sequence[str]) -> int:
     except CpunetError as error:
         raise CpunetError(with_options(str(error))) from error
     if HELP.intersection(words):
-        called_for = [word for word in words if word[0] != "-"]
-        sys.stdout.writelines(f"{line}\n" for line in examples(called_for))
+        # examples of the command, from the docstring of its function; none of a group
+        names = [word for word in words if word[0] != "-"]
+        function = app.parse_commands(names)[1][-1].default_command
+        _, _, after = (inspect.getdoc(function) or "").partition("Examples\n--------\n")
+        lines = [
+            f"  {line}\n" for line in (line.strip("` ") for line in after.splitlines()) if line
+        ]
+        sys.stdout.writelines(["Examples:\n", *lines] if after else [])
     if not words or (words[0] in GROUPS and len(words) == 1):
         return USAGE  # the help was shown
     if result is not None:
@@ -151,20 +157,10 @@ def run(words: Sequence[str]) -> int:
     return 0 if getattr(result, "ok", True) else BUG
 
 
-def examples(words: Sequence[str]) -> list[str]:
-    """Examples of a command, from the docstring of its function; none of a group."""
-    function = app.parse_commands(words)[1][-1].default_command if words else None
-    _, _, after = (inspect.getdoc(function) or "").partition("Examples\n--------\n")
-    lines = [line.strip("` ") for line in after.splitlines()]
-    return ["Examples:", *(f"  {line}" for line in lines if line)] if after else []
-
-
 def main() -> None:
     """Run the command line: it ends in one line on stderr, if anything goes wrong."""
-    words = sys.argv[1:]
-    end = words.index("--") if "--" in words else len(words)  # then names only
-    debug = DEBUG in words[:end]  # wherever it stands
-    words = [word for word in words[:end] if word != DEBUG] + words[end:]
+    debug = DEBUG in sys.argv  # wherever it stands
+    words = [word for word in sys.argv[1:] if word != DEBUG]
     logger, handler = logging.getLogger("cpunet"), logging.StreamHandler(sys.stderr)
     handler.setFormatter(_Lines())
     level = logger.level
@@ -177,7 +173,17 @@ def main() -> None:
     caught = [n for n in STOPPING if signal.getsignal(n) != signal.SIG_IGN]  # as by nohup
     handlers = {n: signal.signal(n, stop) for n in caught}
     try:
-        sound_environment()
+        # Pictures are written to files, whatever backend a notebook shows its own with; a
+        # terminal that says it is no column wide shows text as any other.
+        os.environ["MPLBACKEND"] = "agg"
+        for name in ("COLUMNS", "LINES", "NUMBA_NUM_THREADS"):
+            if not os.environ.get(name, "1").isdecimal() or os.environ.get(name) == "0":
+                del os.environ[name]
+        # OpenMP's threads wait for each other in busy loops: if other programs run as well, the
+        # thread that the others wait for often has no core, because a waiting one occupies it.
+        # Short loops bridge the gaps between two operations; a thread that waits longer sleeps.
+        if not os.environ.keys() & {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}:
+            os.environ["GOMP_SPINCOUNT"] = SPIN_COUNT
         for stream in (sys.stdout, sys.stderr):
             if isinstance(stream, io.TextIOWrapper):  # of any encoding
                 stream.reconfigure(errors="replace")
@@ -192,24 +198,6 @@ def main() -> None:
         logger.setLevel(level)
         logger.removeHandler(handler)
     sys.exit(status)
-
-
-def sound_environment() -> None:
-    """Mend variables that libraries read when they are loaded, and which may be nonsense here.
-
-    Pictures are written to files, whatever backend a notebook shows its own with; a terminal
-    that says it is no column wide shows text as any other.  OpenMP's threads wait for each
-    other in busy loops: if other programs run as well, the thread that the others wait for
-    often has no core, because a waiting one occupies it.  Short loops bridge the gaps between
-    two operations; a thread that waits longer sleeps.  If the user has set OpenMP's own
-    variables, these are not changed.
-    """
-    os.environ["MPLBACKEND"] = "agg"
-    for name in ("COLUMNS", "LINES", "NUMBA_NUM_THREADS"):
-        if not os.environ.get(name, "1").isdecimal() or os.environ.get(name) == "0":
-            del os.environ[name]
-    if not os.environ.keys() & {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"}:
-        os.environ["GOMP_SPINCOUNT"] = SPIN_COUNT
 
 
 class _Lines(logging.Formatter):

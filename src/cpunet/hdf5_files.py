@@ -117,11 +117,6 @@ def text_attribute(item: h5py.Group | h5py.Dataset, name: str) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
-def texts_of(item: h5py.Group | h5py.Dataset) -> dict[str, str]:
-    """All attributes of an item as text."""
-    return {name: text_attribute(item, name) for name in item.attrs}
-
-
 def units_of(item: h5py.Group | h5py.Dataset) -> str:
     """Units of an item, ``""`` if it names none."""
     return text_attribute(item, "units") or text_attribute(item, "unit")

@@ -57,9 +57,7 @@ def part(name: str, *values: Any, **named: Any) -> Markup:
     return Markup(macro(*values, **named))
 
 
-def figure_html(
-    caption: str, figure: Figure, file: Path | None = None, shows: str = ""
-) -> Markup:
+def figure_html(caption: str, figure: Figure, file: Path, shows: str = "") -> Markup:
     """Return a figure with its caption, as SVG, and write it to a file of its own.
 
     `shows` says what it shows to who cannot see it.
@@ -69,8 +67,7 @@ def figure_html(
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": caption}):
         metadata = dict.fromkeys(("Creator", "Date", "Format", "Type"))
         figure.savefig(stream, format="svg", metadata=metadata)
-    if file is not None:
-        file.write_text(stream.getvalue(), encoding="utf-8")
+    file.write_text(stream.getvalue(), encoding="utf-8")
     svg = stream.getvalue().partition("<svg ")[2]
     svg = re.sub(rf'<g id="{GROUP}', '<g data-method="', f'<svg role="img" {svg}')
     # other figures of a page have the same

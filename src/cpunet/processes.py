@@ -19,7 +19,7 @@ import signal
 import sys
 import threading
 from collections.abc import Callable, Generator, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager, suppress
 from functools import partial
@@ -99,16 +99,15 @@ def _in_processes(
     with ProcessPoolExecutor(jobs, context, _begin, (make,)) as pool:
         try:
             left |= {pool.submit(_work, task): task for task in tasks}
-            while left:
-                for future in wait(left, return_when=FIRST_COMPLETED).done:
-                    outcome, records = future.result()
-                    for record in records:
-                        logger = logging.getLogger(record.name)
-                        again = once and record.msg in noted
-                        if not again and logger.isEnabledFor(record.levelno):
-                            logger.handle(record)
-                        noted.add(record.msg)
-                    yield left.pop(future), outcome
+            for future in as_completed([*left]):
+                outcome, records = future.result()
+                for record in records:
+                    logger = logging.getLogger(record.name)
+                    again = once and record.msg in noted
+                    if not again and logger.isEnabledFor(record.levelno):
+                        logger.handle(record)
+                    noted.add(record.msg)
+                yield left.pop(future), outcome
         except BrokenProcessPool as error:
             # each process runs the main script again, which may have no guard
             script = Path(getattr(sys.modules["__main__"], "__file__", None) or "")

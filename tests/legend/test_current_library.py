@@ -14,7 +14,7 @@ from lgdo import Array, Scalar, Struct
 
 from cpunet.errors import CpunetError
 from cpunet.legend.currents import PEAK, add_rings, currents_about_peak
-from cpunet.legend.library_files import make_library, merge_libraries
+from cpunet.legend.library_files import make_library
 from cpunet.legend.translate_library import (
     TemplateTranslator,
     chosen_libraries,
@@ -165,27 +165,6 @@ def test_axes_and_periods_as_others_write_them(chain: Path, tmp_path: Path) -> N
     assert there[np.isfinite(charge()[..., 0])].all()
 
 
-def test_detectors_in_one_file(chain: Path, current: Path, tmp_path: Path) -> None:
-    other = write(tmp_path / "ideal.lh5", charge(), "B02")
-    both, out = [current, tmp_path / "b.lh5"], str(tmp_path / "psl.lh5")
-    translate_library(chain, other, both[1])
-    assert merge_libraries(both, out) == sorted(lh5.ls(out)) == ["B02", "V01"]
-    assert lh5.read("B02", out).attrs["cpunet"]
-    for sources, words in (
-        ([both[0], out], "a second library of V01"),
-        ([other], "no current"),
-    ):
-        with pytest.raises(CpunetError, match=words):
-            merge_libraries(sources, tmp_path / "x.lh5")
-    assert not (tmp_path / "x.lh5").exists()
-    with h5py.File(both[1], "a") as file:  # with the groups about it
-        file.move("B02", "geds/B02")
-    assert merge_libraries(both, out, force=True) == ["V01", "geds/B02"]
-    inner, alone = lh5.read("geds", out)["B02"], lh5.read("geds/B02", str(both[1]))
-    for name in ("waveform_000_deg", "drift_time_045_deg"):
-        np.testing.assert_array_equal(inner[name].nda, alone[name].nda)
-
-
 def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
     waveforms[which] = np.nan
     return waveforms
@@ -201,7 +180,6 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
         (dict.fromkeys(WAVEFORMS), "no pulse-shape library"),
         (dict.fromkeys(WAVEFORMS, Array(-charge())), "84 of 84 templates end below half"),
         ({"r": Array(R[::-1].copy(), attrs={"units": "mm"})}, "r does not ascend"),
-        ({"z": Array(Z, attrs={"units": "m"})}, "z reaches 7000 mm"),
         ({"r": Array(R, attrs={"units": "inch"})}, "r is in 'inch'"),
         (
             {"r": Array(np.arange(4.0), attrs={"units": "mm"})},

@@ -175,7 +175,6 @@ def adc(pulses: np.ndarray, noise: float = 8.0, gain: float = 30_000.0) -> np.nd
 def test_the_look(pulses, side):
     found = apparent_side(pulses)
     assert (found and found.side) == side
-    assert not (found and found.certain)
 
 
 def source_of(path, waveforms, **attrs):
@@ -199,7 +198,6 @@ def source_of(path, waveforms, **attrs):
 def test_what_a_file_says(tmp_path, attrs, side):
     found = recorded_side(source_of(tmp_path / "pulses.lh5", charge(), **attrs))
     assert (found and found.side) == side
-    assert found is None or found.certain
 
 
 def test_a_guess_can_be_overruled_and_a_record_cannot(tmp_path):

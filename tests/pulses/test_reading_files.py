@@ -127,7 +127,7 @@ def test_what_is_missing_is_unknown_in_arrays_of_any_kind():
     np.testing.assert_array_equal(Pulses.of(jagged, dt_ns=16).waveforms, np.eye(3))
 
 
-@pytest.mark.parametrize("suffix", [".lh5", ".fcio", ".npz", ".npy", ""])
+@pytest.mark.parametrize("suffix", [".lh5", ".fcio", ".npz", ""])
 @pytest.mark.parametrize(
     ("start", "words"),
     [

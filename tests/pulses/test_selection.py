@@ -39,17 +39,6 @@ def test_the_nearest_line_whose_window_covers_wins(values, peaks):
         assert covering[label] == min(covering.values()) if covering else label == ""
 
 
-@given(energies, st.integers(0, 3000), st.integers(1, 500))
-def test_neighbouring_ranges_share_nothing_and_miss_nothing(values, low, width):
-    middle, high = low + width, low + 2 * width
-    below, above, whole = (
-        parse_selection(f"{ends[0]}-{ends[1]}", {}).select(values)
-        for ends in ((low, middle), (middle, high), (low, high))
-    )
-    assert not (below & above).any()
-    assert ((below | above) == whole).all()
-
-
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

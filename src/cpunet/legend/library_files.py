@@ -1,4 +1,4 @@
-"""Libraries of pulse shapes in files: simulated, and merged into one file.
+"""Libraries of pulse shapes in files, and how they are simulated.
 
 A library holds the charge pulse of every place in a detector, or the current behind its
 electronics.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -17,7 +17,6 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.hdf5_files import opened
 from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
 from cpunet.pulses.writing import written_hdf5
@@ -31,20 +30,6 @@ WAVEFORM = re.compile(r"waveform_\d{3}_deg")
 LENGTH_NS = 5000.0  # as in libraries of SolidStateDetectors.jl
 ENERGY_KEV = 1000.0  # of each hit; matters only with self-repulsion
 ANGLES_DEG = (0, 45)  # <100> and <110>; reboost interpolates between them
-
-
-def libraries_in(file: h5py.File) -> list[str]:
-    """Paths of the groups that hold templates."""
-    names: list[str] = []
-    file.visit(names.append)
-    return sorted(
-        {
-            name.rpartition("/")[0]
-            for name in names
-            if WAVEFORM.fullmatch(name.rpartition("/")[2])
-            and isinstance(file[name], h5py.Dataset)
-        }
-    )
 
 
 def put(group: h5py.Group, name: str, values: npt.ArrayLike, units: str) -> None:
@@ -61,59 +46,6 @@ def describe(group: h5py.Group) -> None:
     while group.name != "/":
         group.attrs["datatype"] = f"struct{{{','.join(sorted(group))}}}"
         group = group.parent
-
-
-def merge_libraries(
-    sources: Sequence[str | Path], out: str | Path, *, force: bool = False
-) -> list[str]:
-    """Copy current libraries of several detectors into one file, as in production.
-
-    Parameters
-    ----------
-    sources
-        Files that `cpunet library translate` made, each of some detectors.
-    out
-        File to write.
-    force
-        Whether to replace an existing file.
-
-    Returns
-    -------
-    list of str
-        Names of the detectors.
-
-    Raises
-    ------
-    CpunetError
-        If a file contains no current library, or two libraries belong to one detector.
-    """
-    paths, out = [*map(Path, sources)], Path(out)
-    refuse_existing(out, *paths, force=force)
-    first: dict[str, Path] = {}
-    with written_hdf5(out) as (made, _):
-        for path in paths:
-            with opened(path) as file:
-                names = [
-                    name  # times of currents are relative to their maxima
-                    for name in libraries_in(file)
-                    if name
-                    and {"r", "z", "dt", "t0"} <= file[name].keys()
-                    and file[name]["t0"][()] < 0
-                ]
-                if not names:
-                    raise CpunetError(
-                        f"{path}: no current library; make it with `cpunet library translate`"
-                    )
-                for name in names:
-                    if name in first:
-                        raise CpunetError(
-                            f"{path}: a second library of {name}, which {first[name]} has "
-                            "already; give one of each detector"
-                        )
-                    first[name] = path
-                    file.copy(name, made, name)
-                    describe(made[name].parent)
-    return sorted(first)
 
 
 @dataclass(frozen=True)

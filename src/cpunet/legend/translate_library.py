@@ -37,7 +37,7 @@ from cpunet.legend.currents import (
     most_frequent,
     padded_axis,
 )
-from cpunet.legend.library_files import PERIOD_NS, WAVEFORM, describe, libraries_in, put
+from cpunet.legend.library_files import PERIOD_NS, WAVEFORM, describe, put
 from cpunet.networks.response_layer import padding
 from cpunet.outputs import refuse_existing
 from cpunet.progress import stage
@@ -247,7 +247,10 @@ def chosen_libraries(
         If there is no library, a named one is missing, or none belongs to the detector of the
         run.
     """
-    names = libraries_in(file)
+    paths: list[str] = []
+    file.visit(paths.append)
+    arrays = (path.rpartition("/") for path in paths if isinstance(file[path], h5py.Dataset))
+    names = sorted({group for group, _, name in arrays if WAVEFORM.fullmatch(name)})
     if not names:
         raise CpunetError(
             f"{source}: no pulse-shape library (no array waveform_000_deg or the like); give a "

@@ -146,9 +146,7 @@ class Pulses:
 
     @staticmethod
     def concatenate(sets: Sequence[Pulses]) -> Pulses:
-        """Concatenate sets of equal length and sampling."""
-        if not sets:
-            raise CpunetError("no sets of pulses to join")
+        """Concatenate sets of equal length and sampling, at least one."""
         first = sets[0]
         for other in sets[1:]:
             if (other.length, other.dt_ns) != (first.length, first.dt_ns):

@@ -7,7 +7,9 @@ the size of the file.
 from __future__ import annotations
 
 import hashlib
+import json
 import logging
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -48,7 +50,6 @@ MAX_KEV, MIN_KEV = 20_000.0, 20.0
 MIN_SIMULATED_END = 0.98  # a pulse without electronics ends at 1, a measured one decays
 # Windows are shorter by these if so many more of a file's first traces contain them.
 SHORTER_NS, MORE, TRIED = range(320, 3201, 320), 0.01, 1024
-SWAPPED = "are `sim` and `data` swapped?"
 
 
 _OR_PAD = "or allow more preparation.padding_before_ns and padding_after_ns"
@@ -196,7 +197,8 @@ def load_pulses(
         If the pulses are of the other side, none can be used, or their energies are not theirs.
     """
     with file.open() as source:
-        provenance.require_side(source, side, SWAPPED, insist=file.insist)
+        remedy = "are `sim` and `data` swapped?"
+        provenance.require_side(source, side, remedy, insist=file.insist)
         inputs, whole = _read(source, file, side, recipe, selection, max_pulses, shorten)
     recipe, prepared = inputs.recipe.at(inputs.dt_ns), inputs.prepared
     if inputs.baselines is not None:
@@ -316,6 +318,9 @@ def _read(
         _thin(sets, drawn, max_pulses)
     if highest >= lowest and (first == first.round()).all():
         counts = int(lowest), int(highest)
+    detector: str | None = None
+    with suppress(ValueError, LookupError, TypeError):  # other programs may have such a name
+        detector = str(json.loads(source.attrs[provenance.SIMULATION])["detector"]["name"])
     inputs = InputSet(
         _joined(sets),
         source.dt_ns,
@@ -324,7 +329,7 @@ def _read(
         recipe=recipe,
         cuts=None,
         read_as=file.options,
-        detector=provenance.recorded_detector(source),
+        detector=detector,
         baselines=Baselines.concatenate(baselines) if measured else None,
         counts=counts,
     )

@@ -304,16 +304,6 @@ def crossings(waveforms: Values, levels: Values, stops: npt.NDArray[np.int64]) -
     return np.asarray(interpolated_time_point_thresh(waveforms, levels, stops, 0, ord("l")))
 
 
-def last_below(
-    waveforms: FloatArray | Values, stops: npt.NDArray[np.intp], level: FloatArray | Values
-) -> npt.NDArray[np.intp]:
-    """The last sample before a stop at which each pulse is below a level; -1 without any."""
-    below = waveforms < level[:, np.newaxis]
-    below &= np.arange(waveforms.shape[1]) < stops[:, np.newaxis]
-    last = waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
-    return np.where(below.any(axis=1), last, -1)
-
-
 def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> FloatArray:
     """Shift each pulse so that it crosses half of its maximum at sample `n_before`.
 
@@ -373,7 +363,11 @@ def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     finite = np.isfinite(waveforms).all(axis=1)
     top = np.where(finite, waveforms.argmax(axis=1), 0)
     height = waveforms[np.arange(len(waveforms)), top]
-    before = last_below(waveforms, top, 0.5 * height)
+    # the last sample before the maximum that is below its half, -1 without any
+    below = waveforms < 0.5 * height[:, np.newaxis]
+    below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
+    last = waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
+    before = np.where(below.any(axis=1), last, -1)
     if not (usable := finite & (height > 0) & (before >= 0)).any():
         return moved
     pulses, before = waveforms[usable], before[usable]

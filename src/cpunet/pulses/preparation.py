@@ -137,7 +137,7 @@ class Prepared:
         Raises
         ------
         CpunetError
-            If there is no set, or lengths or sampling periods differ.
+            If lengths or sampling periods differ.
         """
         pulses = Pulses.concatenate([s.pulses for s in sets])
         starts = np.cumsum([0, *(s.n_read for s in sets[:-1])])
@@ -265,8 +265,8 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
     Parameters
     ----------
     prepared
-        Measured pulses of one channel.  Pulses of several energies must have been prepared
-        from raw traces: if they were scaled before, their different noise is hidden.
+        Measured pulses of one channel, at least one.  Pulses of several energies must have been
+        prepared from raw traces: if they were scaled before, their different noise is hidden.
     config
         Half-widths in robust standard deviations.
 
@@ -275,14 +275,7 @@ def fit_cuts(prepared: Prepared, config: CutConfig) -> CutWindows:
     CutWindows
         Windows for ``tail_slope``, ``chi2`` (upper bound only), ``baseline`` and
         ``baseline_slope``; none with fewer than ten pulses.
-
-    Raises
-    ------
-    CpunetError
-        If the set is empty.
     """
-    if not len(prepared):
-        raise CpunetError("no pulses to draw quality cuts from; select more energies or files")
     amplitude = float(np.median(prepared.scale))
     noise = float(np.median(prepared.baseline_rms * prepared.scale))
     sigmas = {"tail_slope": config.decay_sigmas, "chi2": config.chi2_sigmas}

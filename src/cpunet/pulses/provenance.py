@@ -61,13 +61,10 @@ class Recognised(NamedTuple):
         Simulated or measured; translated pulses count as the side they imitate.
     why
         Reason, phrased to follow "these".
-    certain
-        Whether the file states the side; otherwise it is a guess.
     """
 
     side: Kind
     why: str
-    certain: bool
 
 
 def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool) -> None:
@@ -90,11 +87,11 @@ def require_side(source: PulseSource, wanted: Kind, remedy: str, *, insist: bool
         If the file states that its pulses are of the other side, or if they appear to be
         and `insist` is False.
     """
-    side = recorded_side(source)
+    side = recorded = recorded_side(source)
     if side is None and not insist:
         side = apparent_side(next(source.blocks(_FIRST_PULSES)).waveforms)
     if side is not None and side.side != wanted:
-        if not side.certain:
+        if recorded is None:
             begin = " If" if remedy.endswith("?") else "; if"
             remedy += f"{begin} they are {wanted}, say so with `insist`"
         text = f"{source.path}: given as {wanted} pulses, but these {side.why}"
@@ -105,19 +102,12 @@ def recorded_side(source: PulseSource) -> Recognised | None:
     """Side recorded in a file that this program wrote; None for other files."""
     side, made_by = source.attrs.get(SIDE), source.attrs.get(MADE_BY, "")
     if network := _NETWORKS.get(source.attrs.get(TRANSLATED_BY, "")):
-        why = f"were translated by {network} already"
-        return Recognised("measured" if network == "REN" else "simulated", why, True)
+        made: Kind = "measured" if network == "REN" else "simulated"
+        return Recognised(made, f"were translated by {network} already")
     if made_by.startswith(SIMULATE) or side == "simulated":
-        return Recognised("simulated", f"were simulated by {made_by}", True)
+        return Recognised("simulated", f"were simulated by {made_by}")
     if side == "measured":
-        return Recognised("measured", f"are traces behind electronics ({made_by})", True)
-    return None
-
-
-def recorded_detector(source: PulseSource) -> str | None:
-    """Name of the simulated detector; None if the file does not contain it."""
-    with suppress(ValueError, LookupError, TypeError):
-        return str(json.loads(source.attrs[SIMULATION])["detector"]["name"])
+        return Recognised("measured", f"are traces behind electronics ({made_by})")
     return None
 
 
@@ -157,11 +147,12 @@ def apparent_side(waveforms: npt.NDArray[np.floating]) -> Recognised | None:
         turns.append(np.median([np.count_nonzero(np.diff(row[row != 0])) for row in signs]))
     whole = (traces == np.round(traces)).all() and np.median(height) > _FULL_HEIGHT
     if whole and turns[0] >= _TURNS:
-        why = "look measured (whole numbers with noise before the pulse)"
-        return Recognised("measured", why, False)
+        return Recognised(
+            "measured", "look measured (whole numbers with noise before the pulse)"
+        )
     end = (traces[:, -few:].mean(axis=1) - traces.min(axis=1)) / height
     if max(turns) < _TURNS and np.median(end) > _MIN_END:
-        return Recognised("simulated", "look simulated (no noise, no decay)", False)
+        return Recognised("simulated", "look simulated (no noise, no decay)")
     return None
 
 

@@ -196,11 +196,9 @@ def all_parameters(
         block = np.array(pulses.waveforms[good], dtype=np.float32, order="C")
         # overflows become NaN below
         with np.errstate(all="ignore"):
-            given = None if amplitudes is None else amplitudes[good]
+            own = current_amplitude(block, dt_ns) if amplitudes is None else amplitudes[good]
             columns = {
-                "current_amplitude": current_amplitude(block, dt_ns)
-                if given is None
-                else given,
+                "current_amplitude": own,
                 "drift_time": drift_time(block, dt_ns, scores.drift_start_fraction),
                 "tail_slope": tail_slope(block, dt_ns, preparation.decay_fit_samples),
             }

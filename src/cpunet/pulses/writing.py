@@ -91,8 +91,6 @@ class PulseWriter:
     n_pulses: int = field(default=0, init=False)
 
     def __enter__(self) -> Self:
-        if not self.table.strip("/"):
-            raise CpunetError(f"{self.path}: the table has no name; give one such as geds/sim")
         refuse_existing(Path(self.path), force=self.force)
         self._stack = ExitStack()
         written = written_hdf5(Path(self.path))
@@ -116,8 +114,6 @@ class PulseWriter:
             Further values per event: name → (array of shape ``(n,)``, units), or an LH5 object
             of n rows.
         """
-        if len(pulses) == 0:
-            return
         n_rows = max(1, _CHUNK_BYTES // (4 * max(1, pulses.length)))
         settings = {"chunks": (n_rows, pulses.length), **_COMPRESSION}
         # not called "units": dspeed copies that attribute to its table buffer, which the LH5
@@ -148,10 +144,11 @@ class PulseWriter:
         attrs
             Attributes of the table.
         """
-        content = {
-            name: column if isinstance(column, LGDO) else _array(*column)
-            for name, column in columns.items()
-        }
+        content = dict(columns)
+        for name, column in columns.items():
+            if not isinstance(column, LGDO):
+                attrs_of = {"units": column[1]} if column[1] else {}
+                content[name] = Array(np.asarray(column[0]), attrs=attrs_of)
         if len(next(iter(content.values()))) == 0:
             return
         group, _, name = table.strip("/").rpartition("/")
@@ -163,10 +160,6 @@ class PulseWriter:
         """Set an attribute of the table of pulses after the first block, or of the `file`."""
         item = self._file if file else self._file[self.table.strip("/")]
         item.attrs[name] = text
-
-
-def _array(values: npt.ArrayLike, units: str) -> Array:
-    return Array(np.asarray(values), attrs={"units": units} if units else {})
 
 
 class HeldFile(io.FileIO):
@@ -281,11 +274,11 @@ def _rows(item: Any, units: str, chosen: npt.NDArray[Any] | None, start: int, n:
     some = None if chosen is None else chosen[start : start + n]
     if _is_lh5(item):
         return lh5_rows(item, 0 if some is not None else start, n, some)
+    attrs = {"units": units} if units else {}
     if item.ndim == 0:
-        return _array(np.full(n, item[()]), units)
+        return Array(np.full(n, item[()]), attrs=attrs)
     part = slice(start, start + n) if some is None else slice(some[0], some[-1] + 1)
     rows: Any = item[part] if some is None else item[part][some - some[0]]
-    attrs = {"units": units} if units else {}
     if rows.ndim > 1:
         return ArrayOfEqualSizedArrays(nda=rows, attrs=attrs)
     if rows.dtype.kind == "O":

@@ -322,11 +322,9 @@ def table_sizes(path: str | Path) -> dict[str, int | None]:
         return channel_sizes(path)
     if format_ != "HDF5":
         return {}
-    from cpunet.hdf5_files import opened
     from cpunet.pulses.reading.hdf5 import channel_tables
 
-    with opened(path) as file:
-        return dict.fromkeys(channel_tables(path, file))
+    return dict.fromkeys(channel_tables(path))
 
 
 def recognise(path: Path) -> str:

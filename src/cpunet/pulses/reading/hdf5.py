@@ -40,7 +40,8 @@ def read_hdf5(options: PulseFile) -> PulseSource:
         name = choose_waveforms(path, file, options.place)
         table, _, own_name = name.rpartition("/")
         group, values, times = file[table or "/"], file[name], dict[str, Column]()
-        columns, attrs = columns_of(path, group), h5.texts_of(file) | h5.texts_of(group)
+        columns = columns_of(path, group)
+        attrs = {n: h5.text_attribute(item, n) for item in (file, group) for n in item.attrs}
         if is_lh5 := isinstance(values, h5py.Group):
             times, values = columns_of(path, values), values["values"]
         else:
@@ -172,19 +173,19 @@ def waveform_tables(file: h5py.File) -> list[str]:
     return sorted({path for broken, table in folders for path in broken or table})
 
 
-def channel_tables(path: Path, file: h5py.File) -> list[str]:
-    """The same, with the rows of each channel where one table holds several."""
+def channel_tables(path: Path) -> list[str]:
+    """The same of a file, with the rows of each channel where one table holds several."""
     channels: list[str] = []
-    for table in waveform_tables(file):
-        try:
-            group = h5.item_at(file, table) or file
-            columns = columns_of(path, group) if isinstance(group, h5py.Group) else {}
-        except CpunetError:  # said where the table is opened
-            columns = {}
-        n = max((column.size for column in columns.values()), default=0)
-        whole = {name: column for name, column in columns.items() if column.size == n}
-        names = parts(whole, np.arange(n))[1] or [""]
-        channels += [f"{table}/{name}".strip("/") for name in names]
+    with h5.opened(path) as file:
+        for table in waveform_tables(file):
+            try:
+                columns = columns_of(path, h5.item_at(file, table))
+            except CpunetError:  # said where the table is opened
+                columns = {}
+            n = max((column.size for column in columns.values()), default=0)
+            whole = {name: column for name, column in columns.items() if column.size == n}
+            names = parts(whole, np.arange(n))[1] or [""]
+            channels += [f"{table}/{name}".strip("/") for name in names]
     return channels
 
 

@@ -70,8 +70,8 @@ def amplitude(waveforms: npt.NDArray[np.float32]) -> npt.NDArray[np.float64]:
 
 
 Values = npt.NDArray[Any]
-Read = Callable[[int, int], Values]  # rows from one to before another
 Texts = npt.NDArray[np.str_]
+Read = Callable[[int, int], Values]  # rows from one to before another
 
 
 @dataclass(frozen=True, eq=False)
@@ -443,12 +443,9 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             sampling period.
         """
         size, start = min(size, max(1, BLOCK_BYTES // (4 * self.length))), 0
-        while start != self.n_pulses:
-            traces = self.rows(start, start + size)
-            if not len(traces):
-                break
-            yield self._pulses(start, traces)
-            start += len(traces)
+        while start != self.n_pulses and len(pulses := self._pulses(start, start + size)):
+            yield pulses
+            start += len(pulses)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
         if (energies := len(self.of_each.get("energy_kev", range(start)))) != start:
@@ -461,12 +458,12 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         """Read all pulses of the file, or some rows, at once; they must fit in memory."""
         if stop is None:
             return Pulses.concatenate(list(self.blocks()))
-        return self._pulses(start, self.rows(start, stop))
+        return self._pulses(start, stop)
 
-    def _pulses(self, start: int, traces: npt.NDArray[Any]) -> Pulses:
-        """Traces with their energies, numbers and times."""
+    def _pulses(self, start: int, stop: int) -> Pulses:
+        """Traces of some rows with their energies, numbers and times."""
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
-            waveforms = np.asarray(traces, np.float32)
+            waveforms = np.asarray(self.rows(start, stop), np.float32)
         n = len(waveforms)
         of_each = {name: values[start : start + n] for name, values in self.of_each.items()}
         numbers = of_each.get("event_number", np.arange(start, start + n))
@@ -488,11 +485,10 @@ class PulseSource(AbstractContextManager["PulseSource"]):
                 f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
                 "split the file by sampling period"
             )
-        t0_ns = of_each.get("t0_ns", 0.0)
         return Pulses.of(
             waveforms,
             dt_ns=self.dt_ns,
             energy_kev=energy_kev,
             event_number=event_number,
-            t0_ns=t0_ns,
+            t0_ns=of_each.get("t0_ns", 0.0),
         )
