@@ -108,9 +108,9 @@ def test_a_run(home, run):
     assert list(covariance) == list(covariance.index) == list(run.fit.errors)
     errors = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(errors, list(run.fit.errors.values()))
-    values = cpunet.compare(run, run).values
+    values = cpunet.response(run, run).values
     assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
-    with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
+    with pytest.raises(cpunet.CpunetError, match="a run has no scores; validate it, or"):
         cpunet.compare(run, run.folder)
 
 
@@ -232,7 +232,7 @@ NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e-\d+)?")
 def require_alike(printed: str, shown: str) -> None:
     """The same words; numbers as near as those of another processor."""
     words = [
-        " ".join(re.sub(r"[+-]?#", "#", NUMBER.sub("#", t)).split()) for t in (printed, shown)
+        " ".join(re.sub(r"[+−-]?#", "#", NUMBER.sub("#", t)).split()) for t in (printed, shown)
     ]
     assert words[0] == words[1]
     numbers = [[float(n) for n in NUMBER.findall(text)] for text in (printed, shown)]

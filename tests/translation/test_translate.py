@@ -533,6 +533,3 @@ def test_names(run, many, sequential, tmp_path):
     shared = [PulseFile(one.path, energy="hit.lh5:a/b") for one in many]
     with pytest.raises(CpunetError, match="belongs to one file"):
         translate(run, shared, tmp_path / "out")
-    (tmp_path / "sim_0.lh5").hardlink_to(many[1].path)
-    with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
-        translate(run, many, tmp_path, force=True)

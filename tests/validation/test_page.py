@@ -197,7 +197,7 @@ def test_survival_by_ranges_and_the_noise_are_tables(tmp_path):
     told = [re.findall(r">([^<>]+)</td>", row) for row in rows]
     assert ["Qbb", "Data", "400", "33.3 ± 3.5"] in told
     assert ["REN translation", "2", "–", "there is no cut"] in told  # of the same range
-    assert ["SEP", "REN translation", "90", "200", "1.00 ± 0.10", "–", "-1.5", "–"] in told
+    assert ["SEP", "REN translation", "90", "200", "1.00 ± 0.10", "–", "−1.5", "–"] in told
 
 
 @pytest.fixture

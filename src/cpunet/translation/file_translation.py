@@ -51,6 +51,10 @@ from cpunet.translation.translator import (
 
 log = logging.getLogger(__name__)
 
+# a file, its output, and a name that is combined with the seed, so that the noise of files or
+# channels differs; None for the noise of `Translator.translate`
+Task = tuple[PulseFile, Path, str | None]
+
 HIGHEST = int(np.iinfo(np.uint16).max)
 RISE_NS = 320.0  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
@@ -147,23 +151,11 @@ class FileTranslation:
                 "baseline and decay without noise"
             )
 
-    def __call__(
-        self, source: PulseFile, out: Path, noise_key: str | None = None
-    ) -> Translation:
+    def __call__(self, task: Task) -> Translation:
         """Translate a file, block by block, with its rows and other columns.
 
         Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
         ``rejection`` contains the reason (0: translated).
-
-        Parameters
-        ----------
-        source
-            Simulated pulses, or measured ones for the inverse.
-        out
-            LH5 file to write.
-        noise_key
-            Name that is combined with the seed, so that the noise of files or channels
-            differs; None for the noise of `cpunet.translation.translator.Translator.translate`.
 
         Raises
         ------
@@ -171,12 +163,11 @@ class FileTranslation:
             If source or output cannot be used, no pulse can be translated, the source changes
             meanwhile, or another process writes the same output.
         """
-        anyway = self.force or self.resume
-        refuse_existing(out, self.run.folder, *source.files, force=anyway)
-        before = source_print(source)
+        source, out, noise_key = task
+        refuse_existing(out, self.run.folder, *source.files, force=self.force or self.resume)
         made_by = f"{self.run.weights_sha256}{self.run.recipe!r}"
-        provenance = {
-            "source": before,
+        provenance: dict[str, Any] = {
+            "source": source_print(source),
             "run": hashlib.sha256(made_by.encode()).hexdigest(),
             "options": asdict(self.options) | {"noise_key": noise_key},
         }
@@ -193,7 +184,7 @@ class FileTranslation:
                 others = read_others(counts.read - n, n)
                 columns = {"rejection": (block.codes, ""), **block.truth, **others}
                 writer.append(block.pulses, columns)
-            if source_print(source) != before:
+            if source_print(source) != provenance["source"]:
                 raise CpunetError(
                     f"{source.path}: changed while it was read; translate it once it is "
                     "complete"

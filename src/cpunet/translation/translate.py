@@ -22,7 +22,7 @@ from cpunet.pulses.channels import Outcome, Pair, channels_of, each_channel, own
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, Source, pulse_file
 from cpunet.training.run import INFO, Run, RunLike, as_run, used_run
-from cpunet.translation.file_translation import FileTranslation
+from cpunet.translation.file_translation import FileTranslation, Task
 from cpunet.translation.options import NONE, Adc, TranslateOptions
 from cpunet.translation.translation import Counts, Translation
 
@@ -31,7 +31,6 @@ log = logging.getLogger(__name__)
 OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
 
 Make = Callable[[RunLike], FileTranslation]
-Task = tuple[PulseFile, Path, str]  # a file, its output, and the name of its noise
 
 
 def translate(
@@ -132,7 +131,7 @@ def translate(
         return _channels(make, run, files[0], Path(out))
     if several:
         return _several(make, used_run(run), files, Path(out), jobs)
-    return make(used_run(run))(files[0], Path(out))
+    return make(used_run(run))((files[0], Path(out), None))
 
 
 def _files(
@@ -178,7 +177,7 @@ def _channels(make: Make, runs: RunLike, source: PulseFile, out: Path) -> Outcom
 
 def _channel(make: Make, runs: RunLike, name: str, pair: Pair, place: Path) -> Translation:
     run = used_run(runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO))
-    return make(run)(pair[0], place.with_name(f"{name}.lh5"), name)
+    return make(run)((pair[0], place.with_name(f"{name}.lh5"), name))
 
 
 def _several(
@@ -198,9 +197,6 @@ def _several(
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
     job, tasks = make(run), dict[Path, Task]()
-    # thousands of files are compared by their identity, and not each with each other
-    stats = [source.path.stat() for source in sources if source.path.exists()]
-    inputs = {(stat.st_dev, stat.st_ino) for stat in stats}
     for source in sources:
         to = out / source.path.name
         to = to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5")
@@ -215,12 +211,10 @@ def _several(
                 f"{len(sources)}; translate them one by one"
             )
         refuse_existing(to, run.folder, *source.files, force=job.force or job.resume)
-        if to.exists() and (to.stat().st_dev, to.stat().st_ino) in inputs:
-            raise CpunetError(f"{to}: is the input; choose another `out`")
         tasks[to] = source, to, to.name
     counts, failed = Counts(), list[str]()
     # what the job says is said once: others make theirs in processes of their own
-    begin = partial(_worker, partial(make, run) if jobs > 1 else lambda: job)
+    begin = partial(make, run) if jobs > 1 else lambda: job
     with (
         stage("Translating", len(tasks)) as bar,
         closing(outcomes(begin, [*tasks.values()], jobs, once=True)) as results,
@@ -233,7 +227,7 @@ def _several(
                 failed.append(text if named else f"{source.path}: {text}")
                 log.error(failed[-1])
             else:
-                counts += outcome
+                counts += outcome.counts
     if failed:
         done = len(tasks) - len(failed)
         others = f"; {done} are in {out}" if done else ""
@@ -242,9 +236,3 @@ def _several(
             "continue with `resume`"
         )
     return job.result(replace(counts, files=len(tasks)), path=out)
-
-
-def _worker(make: Callable[[], FileTranslation]) -> Callable[[Task], Counts]:
-    """Return a function that translates a file after the other."""
-    job = make()
-    return lambda task: job(*task).counts

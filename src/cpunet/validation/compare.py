@@ -18,16 +18,9 @@ from cpunet.plotting import label
 from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.pulses.two_sample import TwoSample
 from cpunet.tables import NO_VALUE, text_table, with_std
-from cpunet.training.response import FAR, Response, outliers, response
-from cpunet.training.run import Run, RunLike
-from cpunet.validation.metrics import (
-    MAIN,
-    QUANTITIES,
-    SURVIVAL,
-    Metrics,
-    PeakScores,
-    signed,
-)
+from cpunet.training.response import FAR, outliers
+from cpunet.training.run import Run
+from cpunet.validation.metrics import MAIN, QUANTITIES, SURVIVAL, Metrics, PeakScores, signed
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
 
 if TYPE_CHECKING:
@@ -96,8 +89,7 @@ class Comparison:
     @cached_property
     def rows(self) -> list[Row]:
         """Scores that any run has, ordered by peak."""
-        rows = []
-        metrics = [report.metrics for report in self.reports.values()]
+        rows, metrics = [], [report.metrics for report in self.reports.values()]
         for peak in _union(of_run.peaks for of_run in metrics):
             collected = [_scores(of_run, peak, self.method) for of_run in metrics]
             for title in _union(collected):
@@ -108,10 +100,7 @@ class Comparison:
                 over = NO_VALUE
                 if len(present) > 1:
                     over = with_std(np.median(numbers), np.std(numbers, ddof=1))
-                texts = [
-                    f"{cell[2]}{'*' * (cell[3] == least)}" if cell else NO_VALUE
-                    for cell in cells
-                ]
+                texts = [f"{c[2]}{'*' * (c[3] == least)}" if c else NO_VALUE for c in cells]
                 far = outliers(values, [cell and cell[1] for cell in cells])
                 rows.append(Row(peak, title, values, texts, far, over))
         return rows
@@ -197,11 +186,11 @@ class Comparison:
 
 
 def compare(
-    *reports: RunLike | Report,
+    *reports: str | Path | Report,
     method: str = "ren",
     out: str | Path | None = None,
     force: bool = False,
-) -> Comparison | Response:
+) -> Comparison:
     """Compare the scores of several validations, of one detector or of many.
 
     The page also has links to the reports, room for many detectors and periods, and of three
@@ -210,8 +199,7 @@ def compare(
     Parameters
     ----------
     reports
-        Folders of cpunet validate or demo, or their metrics.json. From Python also reports, or
-        runs, whose readouts are compared as by ``cpunet.response``.
+        Folders of cpunet validate or demo, or their metrics.json; from Python also reports.
     method
         Whose scores: ren, raw, rc, gauss_exp, superpulse, truth.
     out
@@ -221,8 +209,8 @@ def compare(
 
     Returns
     -------
-    Comparison or Response
-        Scores of the runs side by side; of runs, their readouts.
+    Comparison
+        Scores of the runs side by side.
 
     Raises
     ------
@@ -236,14 +224,11 @@ def compare(
 
     cpunet compare results/*/*/report --out results/index.html
     """
-    if runs := [report for report in reports if isinstance(report, Run)]:
-        if len(runs) < len(reports):
-            raise CpunetError("runs and reports are not compared", "validate the runs")
-        return response(*runs, out=out, force=force)
-    scored = [report for report in reports if not isinstance(report, Run)]
+    if any(isinstance(report, Run) for report in reports):
+        raise CpunetError("a run has no scores", "validate it, or compare by cpunet.response")
     if out is not None:
-        refuse_inputs(Path(out), *(of for of in scored if not isinstance(of, Report)))
-    comparison = compared(scored, method=method)
+        refuse_inputs(Path(out), *(of for of in reports if not isinstance(of, Report)))
+    comparison = compared(reports, method=method)
     if out is None:
         return comparison
     comparison.save(out, force=force)

@@ -30,7 +30,6 @@ from cpunet.tables import number, text_table, with_std
 from cpunet.validation.metrics import Metrics, called
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
 
@@ -50,7 +49,6 @@ _NAMES = {
     "ren": "REN",
     "current_amplitude": "I_max",
     "drift_time": "T_drift",
-    "tail_slope": "tail slope",
     "rc_late": "RC + late",
     "ceiling": "data vs data",
 }
@@ -108,7 +106,7 @@ class Report:
     drawn
         Functions that draw the figures, by name; none for a report that was opened.
     notes
-        Paragraphs for the top of the page.
+        Further paragraphs for the top of the page.
     """
 
     metrics: Metrics
@@ -220,42 +218,6 @@ class Report:
             made.fill(method, values[parameter][np.isfinite(values[parameter])])
         return made
 
-    def plot(
-        self,
-        peak: str | None = None,
-        parameter: str = "current_amplitude",
-        ax: Axes | None = None,
-    ) -> Axes:
-        """Draw the distributions of a parameter by method, with its scores; return the axes.
-
-        Parameters
-        ----------
-        peak
-            Name of a scored peak; None for the first.
-        parameter
-            Name of a scored parameter.
-        ax
-            Where to draw; a new figure of pyplot by default.
-
-        Raises
-        ------
-        CpunetError
-            If there is no such peak, or no such parameter is scored there.
-        """
-        from cpunet.plotting import own_axes
-        from cpunet.validation.figures import draw_parameter
-
-        peak = next(iter(self.values)) if peak is None else peak
-        of_peak = named(self.values, peak, "scored peak")
-        compared = named(self.metrics.peaks[peak].parameters, parameter, "scored parameter")
-        values = {method: of_method[parameter] for method, of_method in of_peak.items()}
-        axis = self.hist(peak, parameter).axes[1]
-        ax = own_axes(ax)
-        draw_parameter(ax, values, axis, parameter, compared)
-        ax.set_title(peak)
-        ax.legend()
-        return ax
-
     def save(self, folder: str | Path, force: bool = False) -> None:
         """Write the report to a folder: page, metrics, values and figures.
 
@@ -361,13 +323,13 @@ class Report:
     def _table(self, methods: Iterable[str]) -> tuple[list[str], list[list[str]]]:
         """IoU by peak and parameter, of the methods that have any."""
         of_all = {
-            (peak, _NAMES.get(parameter, parameter)): compared.iou
+            (peak, _NAMES.get(parameter, parameter.replace("_", " "))): compared.iou
             for peak, scores in self.metrics.peaks.items()
             for parameter, compared in scores.parameters.items()
         }
         shown = [m for m in methods if any(m in iou for iou in of_all.values())]
         rows = [
-            [*place, *("–" if iou.get(m) is None else f"{iou[m]:.1f}" for m in shown)]
+            [*place, *(number(iou.get(m), ".1f") for m in shown)]
             for place, iou in of_all.items()
         ]
         return ["peak", "parameter", *(_NAMES.get(m, m) for m in shown)], rows
