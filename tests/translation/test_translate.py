@@ -164,13 +164,6 @@ def test_columns_of_other_formats_and_those_that_cannot_be_copied(run, tmp_path,
     assert "column pair is left out: of type complex128" in told
     assert {"short", "pair"}.isdisjoint(table)
 
-    np.savez(
-        tmp_path / "sim.npz", waveforms=charge(), energy_kev=np.full(N, 1e3), z=np.arange(N)
-    )
-    source = PulseFile(tmp_path / "sim.npz", dt_ns=DT_NS)
-    translate(run, source, tmp_path / "npz.lh5")
-    assert plain(lh5.read("geds/ren", tmp_path / "npz.lh5").z) == list(range(N))
-
 
 def test_channels_have_noise_of_their_own(run, tmp_path):
     source = sim_file(tmp_path / "sim.lh5")

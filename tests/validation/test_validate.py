@@ -212,7 +212,6 @@ def test_a_report(report):
     assert row["iou"] == compared.iou["ren"]
     assert row["ceiling"] == compared.iou["ceiling"]
     assert report.scores.loc["SEP", "drift_time", "ren"].equals(row)
-    assert report.verdicts == report.to_dict()["verdicts"]["summary"]
     assert "current amplitude" in report._repr_html_()
     assert repr(report).startswith(f"<Report {report.folder}: ")
     assert report.figures["FEP mean pulse"].axes

@@ -109,11 +109,6 @@ class Translation:
         return self.pulses.waveforms
 
     @property
-    def valid(self) -> npt.NDArray[np.bool_]:
-        """Which rows hold a pulse, shape (n,)."""
-        return np.asarray(self.codes == Rejection.ACCEPTED)
-
-    @property
     def rejections(self) -> dict[str, int]:
         """Number of rows without a pulse, by reason."""
         return dict(self.counts.rejections)
@@ -158,7 +153,7 @@ class Translation:
         ax
             Where to draw; a new figure of pyplot by default.
         """
-        rows, axes = np.flatnonzero(self.valid)[:n], own_axes(ax)
+        rows, axes = np.flatnonzero(self.codes == Rejection.ACCEPTED)[:n], own_axes(ax)
         pulses = self.pulses
         time_us = np.arange(pulses.length) * pulses.dt_ns * 1e-3
         lines = pulses.waveforms[rows].T
