@@ -71,7 +71,7 @@ def translate(
     tails
         Pile-up tails: ``learned``, ``none``, or a rate in kHz.
     pile_up_khz
-        Rate in kHz of piled-up pulses within a trace.
+        Rate in kHz of piled-up pulses within a trace in ADC counts.
     adc
         Make raw traces in ADC counts, as a digitiser's, instead of normalised windows.
     scale

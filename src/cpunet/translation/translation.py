@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -24,7 +23,6 @@ from cpunet.pulses.shape_parameters import (
     data_axis,
     labelled,
 )
-from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.translator import TranslatedPulses
 
@@ -74,8 +72,6 @@ class Translation:
         The file they were written to, or a folder of several; None if they are in memory only.
     in_memory
         The pulses if they are in memory.
-    writer
-        Opens a file for those in memory.
     """
 
     run: str
@@ -84,7 +80,6 @@ class Translation:
     adc: bool
     path: Path | None = None
     in_memory: TranslatedPulses | None = None
-    writer: Callable[..., PulseWriter] | None = None
 
     @cached_property
     def pulses(self) -> Pulses:
@@ -170,21 +165,6 @@ class Translation:
         }
         columns |= {} if self.adc else self.parameters
         return self.pulses.to_dataframe().assign(**columns)
-
-    def save(self, path: str | Path, *, force: bool = False) -> Path:
-        """Write pulses that are in memory to an LH5 file, without other columns of the source.
-
-        Raises
-        ------
-        CpunetError
-            If they are in a file, or the file exists (without `force`) or cannot be written.
-        """
-        if self.in_memory is None or self.writer is None:
-            raise CpunetError(f"{self.path}: holds these pulses already; copy it")
-        with self.writer(Path(path), force=force) as writer:
-            done = self.in_memory
-            writer.append(done.pulses, {"rejection": (done.codes, ""), **done.truth})
-        return Path(path)
 
     def __len__(self) -> int:
         return self.counts.read
