@@ -75,6 +75,12 @@ def metrics() -> dict:
         },
         "training": {"recipe": "paper", "seconds": 12.5, "device": "cpu"},
         "rejections": {"data": {"saturated": 3}, "simulation": {"no <edge>": 4}},
+        "tails": {
+            "rate_khz": 1.5,
+            "rate_error_khz": 0.1,
+            "decay_us": 85.0,
+            "percent_above": {"50_kev": {"measured": 20.0, "law": 19.0}},
+        },
     }
 
 
@@ -111,6 +117,8 @@ def test_page_shows_scores_counts_and_provenance(report):
         "simulation: no &lt;edge&gt;",
         "1 &lt; 2 &amp; 3.",
         "<td>device</td><td>cpu</td>",
+        "pile-up tails, 1.50 ± 0.10 kHz decaying with",
+        "20.0 (19.0) above 50 keV.",
     ):
         assert text in html
     for text in (">12.3 ± 1.2<", ">9.0 ± 2.1<"):
