@@ -56,37 +56,21 @@ _SHOWN = ("raw", "ren", "truth", "ceiling")  # methods in a notebook's table
 
 
 FIRST = 3  # figures of overlap and mean pulses at the top of the page, and of noise
-# What a figure shows, for readers of its text alone, by section and the end of its name.
-SECTIONS = {
-    "first": {
-        "overlap with data": "overlap with data by quantity and method; band: data with data",
-        "mean pulse": "mean pulse of the data and each method; differences in standard errors",
-    },
-    "slices": {
-        "superpulses": "mean pulses in four ranges of rise time; differences in standard errors"
-    },
-    "noise": {"noise": "noise power before the pulse by frequency, data and REN; their ratio"},
-    "pulses": {
-        "single pulse": "one simulated pulse by each method, and the nearest measured one"
-    },
-    "further": {
-        "further parameters": "distributions of further parameters, data and each method"
-    },
-    "ae": {
-        "A over E survival": "survival of other peaks against that of the double-escape peak"
-    },
-    "ae_energy": {
-        "A over E and energy": "position and width of the single-site A/E peak against energy"
-    },
-    "others": {
-        "losses": "losses of the training by iteration",
-        "cycle of simulation": "simulated pulses, their translations, and those back",
-        "cycle of data": "measured pulses, their translations, and those back",
-    },
-    "distributions": {
-        "": "distribution in the data and by each method, and differences in standard errors"
-    },
-}
+# Section, end of the name of a figure, and what it shows, for readers of its text alone.
+SECTIONS = (
+    ("first", "overlap with data", "overlap with data by method; band: data with data"),
+    ("first", "mean pulse", "mean pulses by method; differences in standard errors"),
+    ("slices", "superpulses", "mean pulses in four ranges of rise time; differences"),
+    ("noise", "noise", "noise power before the pulse by frequency, data and REN; ratio"),
+    ("pulses", "single pulse", "a simulated pulse by each method, and the nearest measured"),
+    ("further", "further parameters", "distributions of further parameters by method"),
+    ("ae", "A over E survival", "survival of other peaks against that of the DEP"),
+    ("ae_energy", "A over E and energy", "position and width of the A/E peak against energy"),
+    ("others", "losses", "losses of the training by iteration"),
+    ("others", "cycle of simulation", "simulated pulses, their translations, and those back"),
+    ("others", "cycle of data", "measured pulses, their translations, and those back"),
+    ("distributions", "", "distributions by method, and differences in standard errors"),
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -252,17 +236,12 @@ class Report:
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
 
-        placed: dict[str, dict[str, Markup]] = {place: {} for place in SECTIONS}
+        placed: dict[str, dict[str, Markup]] = {place: {} for place, _, _ in SECTIONS}
         with stage("Drawing", len(self.drawn)) as bar:
             for name, draw in self.drawn.items():
                 stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
                 caption = name.replace("_", " ")
-                place, shows = next(
-                    (section, text)
-                    for section, of_section in SECTIONS.items()
-                    for end, text in of_section.items()
-                    if caption.endswith(end)
-                )
+                place, _, shows = next(of for of in SECTIONS if caption.endswith(of[1]))
                 placed[place][name] = figure_html(
                     caption, draw(), folder / f"{stem}.svg", shows
                 )
@@ -278,20 +257,15 @@ class Report:
             few = [n for n in shown if not n.startswith(trained)][:FIRST] or [*shown][:FIRST]
             placed["others"] |= {name: html for name, html in shown.items() if name not in few}
             placed[place] = {name: shown[name] for name in few}
-        good, verdict = metrics.headline() if metrics.scored else (False, "")
         html = rendered(
             "report.html",
             title="CPU-Net validation",
             metrics=metrics,
             placed={place: [*of_place.values()] for place, of_place in placed.items()},
             notes=self.notes,
-            good=good,
-            headline=verdict,
-            methods=[{"name": m, "label": label(m), "colour": COLOURS[m]} for m in methods],
-            rejections=[*flat(metrics.rejections, ": ")],
-            training=[*flat(metrics.training, ": ")],
+            colours={method: COLOURS[method] for method in methods},
             script=Markup(asset("report.js")),
-            **{f.__name__: f for f in (called, label, number, with_std)},
+            **{f.__name__: f for f in (called, flat, label, number, with_std)},
             unit=lambda name: LABELLED[name].unit,
         )
         (folder / PAGE).write_text(html, encoding="utf-8")
