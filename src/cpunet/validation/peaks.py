@@ -36,12 +36,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.parameters import (
-    PARAMETERS,
-    Values,
-    align_half_maximum,
-    pulse_parameters,
-)
+from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
 from cpunet.pulses.two_sample import LARGEST, TwoSample, classifier_auc
