@@ -33,7 +33,7 @@ def main() -> None:
     arguments.add_argument("run", type=Path)
     given = arguments.parse_args()
     run = Run.load(given.run)
-    ren, recipe, selection = REN(run), run.recipe, parse_selection("100-1000", {})
+    ren, recipe, selection = REN.of(run), run.recipe, parse_selection("100-1000", {})
     sim = load_pulses(PulseFile(given.stand / "sim.lh5"), "simulated", recipe, selection)
     data = load_pulses(PulseFile(given.stand / "data.lh5"), "measured", recipe, selection)
     noise = fit_baseline_methods(ren, sim, data, selection, fitted=False)

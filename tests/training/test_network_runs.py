@@ -67,7 +67,7 @@ def test_networks_that_gain_are_behind_the_readout_and_its_inverse(kept, files):
     assert "AUC of held-out pulses" in gains["U-Net of REN"]
     assert "RMS of held-out cycles" in gains["U-Net of IREN"]
     again = Run.load(kept.folder)
-    ren, iren = REN(again), IREN(again)
+    ren, iren = REN.of(again), IREN.of(again)
     assert ren.backend.network.residual is not None
     pulses = phased_edges(5, np.random.default_rng(5), 450, 1100)
     windows = ren.translate(pulses, noise=False)
@@ -82,7 +82,7 @@ def test_networks_that_gain_are_behind_the_readout_and_its_inverse(kept, files):
 
 def test_a_mended_network_translates_as_it_was_trained(files, tmp_path):
     run = train(*files, tmp_path / "run", recipe=load_recipe("paper", SMALL), device="cpu")
-    ren, iren = REN(run), IREN(run)
+    ren, iren = REN.of(run), IREN.of(run)
     pulses = phased_edges(8, np.random.default_rng(5), 450, 1100)
     clean = ren.translate(pulses, noise=False)
     # prepared again: the baseline is 0, the level that of the data

@@ -210,7 +210,7 @@ def translate_library(
     """
     run, source, out = used_run(run), Path(library), Path(out)
     refuse_existing(out, run.folder, source, force=force)
-    translate, numbers = TemplateTranslator(REN(run), PERIOD_NS), dict[str, LibraryNumbers]()
+    translate, numbers = TemplateTranslator(REN.of(run), PERIOD_NS), dict[str, LibraryNumbers]()
     with opened(source) as given:
         names = chosen_libraries(given, source, detector, known_detector(run))
         axes = [library_axes(given, name, source) for name in names]

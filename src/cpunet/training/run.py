@@ -265,14 +265,14 @@ class Run(InfoPart):
         """Translator from simulated to measured-like pulses."""
         from cpunet.translation.translator import REN
 
-        return REN(self)
+        return REN.of(self)
 
     @cached_property
     def iren(self) -> IREN:
         """Translator from measured to simulation-like pulses."""
         from cpunet.translation.translator import IREN
 
-        return IREN(self)
+        return IREN.of(self)
 
     @cached_property
     def covariance(self) -> DataFrame:

@@ -95,7 +95,7 @@ def export_onnx(
     for path in (out, noise_file):
         refuse_existing(path, run.folder, force=force)
     kind: type[Translator] = IREN if inverse else REN
-    backend, length = kind(run).backend, run.recipe.preparation.length
+    backend, length = kind.of(run).backend, run.recipe.preparation.length
     facts = {"recipe": run.recipe.name, "peak": run.peak, "seed": run.seed, "dt_ns": run.dt_ns}
     with stage("Exporting"), written_aside(out) as aside:
         checker = needed("onnx").checker

@@ -103,7 +103,7 @@ class FileTranslation:
         self.run, self.options, self.force = as_run(run), options, force
         self.resume = resume and not force
         kind = IREN if options.inverse else REN
-        self.translator: Translator = kind(self.run, resolve_device("auto", self.run.recipe))
+        self.translator: Translator = kind.of(self.run, resolve_device("auto", self.run.recipe))
         adc, tails, config = options.adc, self.translator.tails, self.run.recipe.preparation
         self.result = partial(Translation, self.run.name, self.run.recipe, adc=adc is not None)
         self.tails: DrawnTails | None = None

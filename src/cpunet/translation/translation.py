@@ -6,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,6 @@ from cpunet.translation.translator import TranslatedPulses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from pandas import DataFrame
 
 DRAWN = 50  # pulses in a figure
 
@@ -157,14 +156,6 @@ class Translation:
         axes.set_ylabel("ADC counts" if self.adc else "Normalised charge")
         axes.set_title(f"{len(rows)} of {self.counts.translated} translated pulses")
         return axes
-
-    def to_dataframe(self) -> DataFrame:
-        """Event, energy, reason of rejection and parameters of each pulse, as a data frame."""
-        columns: dict[str, Any] = {
-            "rejection": [Rejection(int(code)).label for code in self.codes]
-        }
-        columns |= {} if self.adc else self.parameters
-        return self.pulses.to_dataframe().assign(**columns)
 
     def __len__(self) -> int:
         return self.counts.read

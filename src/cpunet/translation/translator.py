@@ -82,14 +82,7 @@ class TranslatedPulses:
 class Translator:
     """A trained generator with the preparation that it was trained on.
 
-    Use `REN` with a run, or `REN.load` with its folder.
-
-    Parameters
-    ----------
-    run
-        A run, whose weights match its recipe.
-    device
-        Torch device, ``"cpu"`` or ``"cuda"``.
+    Use `REN.of` with a run, or `REN.load` with its folder.
 
     Attributes
     ----------
@@ -116,6 +109,17 @@ class Translator:
         self.needs_energies = self.backend.noise is not None
         sign = 1 if self.takes == "simulated" else -1
         self.delay_ns = 0.0 if run.fit is None else sign * run.fit.delay_ns
+
+    @classmethod
+    def of(cls, run: Run, device: str = "cpu") -> Self:
+        """Make a translator of a run.
+
+        Raises
+        ------
+        CpunetError
+            If the weights of the run do not match its recipe.
+        """
+        return cls(run, device)
 
     @classmethod
     def load(cls, run: str | Path, device: str = "cpu") -> Self:

@@ -30,7 +30,6 @@ from cpunet.plotting import (
     steps,
     styled,
 )
-from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import LABELLED, data_axis
 from cpunet.tables import number
@@ -95,25 +94,6 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
     if shown[-1] == "accuracy":
         grid[-1].set(ylabel="Part of pairs ordered rightly", ylim=(0.4, 1.02))
         grid[-1].axhline(0.5, color="black", linewidth=0.8)
-    return figure
-
-
-@styled
-def cycle_figure(pulses: Mapping[str, FloatArray], dt_ns: float) -> Figure:
-    """Pulses through a cycle, a panel for each stage (paper, figures of the cycles).
-
-    Parameters
-    ----------
-    pulses
-        Pulses by stage, shape (n, samples); each row is the same event in all.
-    dt_ns
-        Sampling period in ns.
-    """
-    figure, (grid,) = panels((3.4 * len(pulses), 3.2), 1, len(pulses), sharex=True, sharey=True)
-    for axes, (title, windows) in zip(grid, pulses.items(), strict=True):
-        axes.plot(np.arange(windows.shape[1]) * dt_ns * 1e-3, windows.T, linewidth=0.8)
-        axes.set(title=title, xlabel="Time [µs]")
-    grid[0].set_ylabel("Normalised charge")
     return figure
 
 

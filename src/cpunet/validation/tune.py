@@ -268,4 +268,4 @@ class HeldOut:
     def train(self, recipe: Recipe) -> REN:
         """Train on the pulses that are not held out; see `cpunet.training.train`."""
         job = replace(self.job, recipe=recipe.at(self.job.sim.dt_ns))
-        return REN(job.trained(), job.device)
+        return REN.of(job.trained(), job.device)

@@ -197,7 +197,7 @@ def evaluate(
         If the input cannot be used, or no peak can be scored.
     """
     recipe, trained_on = run.recipe, run.peak
-    ren = REN(run, resolve_device("auto", run.recipe))
+    ren = REN.of(run, resolve_device("auto", run.recipe))
     others = further.replace(" ", "").split(",") if further else []
     names = list(dict.fromkeys([*recipe.peaks, trained_on, *others]))
     # energies of the peaks, with all sidebands and continua
