@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from cpunet.electronics.baseline_noise import BaselineNoise
-from cpunet.electronics.drawn_pile_up import DrawnTails
+from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import KeptNoise
 from cpunet.networks.positional_unet import PositionalUNet
@@ -216,7 +216,7 @@ def test_noise_goes_as_one_over_the_energy(noisy_run, prepared_sim):
         np.testing.assert_allclose(again.pulses.waveforms, found, atol=2e-6)
 
 
-def test_tails_are_added_with_the_noise(noisy_run, prepared_sim):
+def test_other_pulses_are_added_with_the_noise(noisy_run, prepared_sim):
     ren, n = REN.load(noisy_run), len(prepared_sim)
     left = np.full(n, 500.0)
 
@@ -230,5 +230,12 @@ def test_tails_are_added_with_the_noise(noisy_run, prepared_sim):
     # 500 keV begin 200 samples before the window and fall within it
     wanted = 0.25 * np.exp(-210 * 0.016 / 50) * -np.expm1(-180 * 0.016 / 50)
     assert fall == pytest.approx(wanted, rel=0.2)
+    rows = np.array([4])
+    piled = InTracePileUp(n, rows, np.array([400.0]), np.array([-4000.0]), np.array([0]))
+    result = windows(piled=piled)
+    step = result[4] - plain[4]
+    # 0.2 of the height of 1, less by the scale: the tail is higher too
+    assert step[180:190].mean() - step[100:110].mean() == pytest.approx(0.17, abs=0.03)
+    assert np.array_equal(result[5], plain[5])
     with pytest.raises(CpunetError, match="drawn with electronic noise"):
         windows(noise=False, tails_kev=left)

@@ -182,20 +182,32 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
 
 
 def test_all_that_pulses_can_be_gives_the_same(run, tmp_path):
-    """A path, a file and pulses; in memory and streamed."""
+    """A path, a file, pulses and arrays; in memory, streamed, and saved later."""
     path = sim_file(tmp_path / "sim.lh5", **many_columns())
     pulses = open_pulses(path).read()
     kept = translate(run, path, seed=4)
     assert kept.waveforms.shape == (len(kept), 800) == (N, 800)
     translate(run, PulseFile(path), tmp_path / "streamed.lh5", seed=4)
     translate(run, pulses, tmp_path / "given.lh5", seed=4)
-    for name in ("streamed", "given"):
+    kept.save(tmp_path / "saved.lh5")
+    for name in ("streamed", "given", "saved"):
         np.testing.assert_array_equal(values(tmp_path / f"{name}.lh5"), kept.waveforms)
     assert "noise True, seed 4" in provenance(open_pulses(tmp_path / "given.lh5"))["options"]
     resumed = translate(run, pulses, tmp_path / "given.lh5", seed=4, resume=True)
     assert resumed.counts.skipped
+    with pytest.raises(CpunetError, match="holds these pulses already"):
+        resumed.save(tmp_path / "again.lh5")
+    with pytest.raises(CpunetError, match=r"saved.lh5: exists already"):
+        kept.save(tmp_path / "saved.lh5")
     with pytest.raises(CpunetError, match="was made with another source"):
         translate(run, pulses[1:], tmp_path / "given.lh5", seed=4, resume=True)
+    array = translate(run, pulses.waveforms, noise=False)
+    assert array.pulses.dt_ns == DT_NS
+    expected = translate(run, pulses, noise=False).waveforms
+    np.testing.assert_array_equal(array.waveforms, expected)
+    table = kept.to_dataframe()
+    assert len(table) == N
+    assert {"energy_kev", "rejection", "current_amplitude"} <= set(table)
     for nothing in ([], pulses[:0]):
         with pytest.raises(CpunetError, match="no pulses"):
             translate(run, nothing)
@@ -410,13 +422,32 @@ def test_piled_up_pulses_are_within_raw_traces_and_told(busy):
         assert added[row, at + 40 : at + 50].mean() == pytest.approx(wanted, rel=0.1, abs=40)
 
 
+def test_piled_up_pulses_are_within_windows(busy, tmp_path):
+    out = tmp_path / "some.lh5"
+    translate(busy, simulated(10 * N), out, pile_up_khz=20, seed=3)
+    table = lh5.read("geds/ren", out)
+    count, kev, after_ns = (table[name].nda for name in PILED)
+    assert len(count) == 10 * N
+    # 20 kHz for a record of 1,400 samples of 16 ns
+    assert count.mean() == pytest.approx(0.448, abs=0.1)
+    # baselines are flat but behind a piled-up pulse, or on its edge
+    windows = values(out)
+    tilt = np.abs(windows[:, :50].mean(axis=1) - windows[:, 100:150].mean(axis=1))
+    assert tilt[count == 0].max() < 0.03
+    inside = (count == 1) & (after_ns > -4500) & (after_ns < -2000) & (kev > 200)
+    assert inside.sum() >= 3
+    heights = windows[inside].max(axis=1)
+    # those within the tail are rejected, as they are in data
+    assert (heights[np.isfinite(heights)] > 0.05).all()
+    assert np.isfinite(heights).any()
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [
         ({"pile_up_khz": -1.0}, "expected a rate in kHz, 0 or more"),
-        ({"pile_up_khz": 1e6, "adc": True}, "give a lower rate"),
-        ({"pile_up_khz": 1.0}, "second pulses are in raw traces alone; add `adc`"),
-        ({"pile_up_khz": 1.0, "adc": True, "noise": False}, "or translate with noise"),
+        ({"pile_up_khz": 1e6}, "give a lower rate"),
+        ({"pile_up_khz": 1.0, "noise": False}, "or translate with noise"),
         ({"pile_up_khz": 1.0, "inverse": True}, "leave out `pile_up_khz`"),
         ({"inverse": True, "adc": True}, "leave out `adc`"),
         ({"adc": True, "scale": Adc(bits=40)}, "`bits` is 40; expected 1 to 24"),
@@ -440,7 +471,7 @@ def test_runs_that_tell_of_no_tails(run, network):
         with pytest.raises(CpunetError, match="the run tells nothing of pile-up tails"):
             translate(folder, simulated(), tails="1")
         with pytest.raises(CpunetError, match=r"tells nothing of .* other pulses"):
-            translate(folder, simulated(), adc=True, pile_up_khz=1)
+            translate(folder, simulated(), pile_up_khz=1)
 
 
 # --- what can go wrong
@@ -476,11 +507,16 @@ def test_a_process_that_is_killed_is_told():
     assert multiprocessing.active_children() == []
 
 
-def test_names(run, many, tmp_path):
+def test_names(run, many, sequential, tmp_path):
+    folder = many[0].path.parent
+    translate(run, str(folder / "sim_*.lh5"), tmp_path / "all")
+    require_same(tmp_path / "all", sequential)
+    strange = sim_file(tmp_path / "a[1].lh5")  # a file may be named like a pattern
+    assert len(translate(run, strange, noise=False)) == N
     with pytest.raises(CpunetError, match=r"other.lh5: no such file; check the name"):
-        translate(run, tmp_path / "other.lh5")
-    with pytest.raises(CpunetError, match=r"ndarray: are no pulses; .* or cpunet\.Pulses\.of"):
-        translate(run, charge())
+        translate(run, folder / "other.lh5")
+    with pytest.raises(CpunetError, match=r"x\*.lh5: no such files; check the name"):
+        translate(run, folder / "x*.lh5")
     with pytest.raises(CpunetError, match="is a file, but several outputs need a folder"):
         translate(run, many, many[0].path)
     twice = [many[0], many[0]]
@@ -489,3 +525,10 @@ def test_names(run, many, tmp_path):
     shared = [PulseFile(one.path, energy="hit.lh5:a/b") for one in many]
     with pytest.raises(CpunetError, match="belongs to one file"):
         translate(run, shared, tmp_path / "out")
+    # the other input is a link to a file that has the name of the output
+    sim_file(tmp_path / "sim_0.lh5")
+    (tmp_path / "links").mkdir()
+    (tmp_path / "links" / "sim_1.lh5").symlink_to(tmp_path / "sim_0.lh5")
+    linked = [many[0], tmp_path / "links" / "sim_1.lh5"]
+    with pytest.raises(CpunetError, match=r"sim_0\.lh5: is the input; choose another"):
+        translate(run, linked, tmp_path, force=True)

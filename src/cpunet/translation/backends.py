@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from cpunet.training.adversarial import Generator
 
 Energies = npt.NDArray[np.float64]
+Floats = npt.NDArray[np.floating]
 Inverse = LinearInverse | Residual  # arrays of windows → pulses
 NOISE = "noise"  # stored with the weights of a CycleGAN, for its translations
 
@@ -45,7 +46,7 @@ class Batch:
     tails_kev
         Pile-up tails under each pulse, in keV.
     piled
-        Piled-up pulses within raw traces.
+        Piled-up pulses within the records.
     trace
         Samples of a raw trace before the alignment of a pulse without noise, and all; None for
         windows.  A network knows its windows alone: beyond them traces are the baseline, and
@@ -119,12 +120,20 @@ class Backend(ABC):
     def translate(self, batch: Batch) -> Translated:
         """Translate a batch of windows."""
 
-    def finished(self, records: FloatArray, batch: Batch) -> Translated:
-        """Records with noise in proportion to 1/energy and tails, prepared like data."""
+    def finished(
+        self, records: FloatArray, batch: Batch, shapes: Floats | None = None
+    ) -> Translated:
+        """Records with noise in proportion to 1/energy and other pulses, prepared like data.
+
+        `shapes` are records of the piled-up pulses, see `InTracePileUp.added`.
+        """
         energy_kev, added = batch.energy_kev, None
         if energy_kev is not None and batch.tails_kev is not None and self.tails is not None:
             left = batch.tails_kev * self.tails.height / energy_kev
             added = left[:, np.newaxis] * self.tails.decay(records.shape[1])
+        if energy_kev is not None and batch.piled is not None and shapes is not None:
+            piled = batch.piled.added(shapes, energy_kev, self.dt_ns, records.shape[1])
+            added = piled if added is None else added + piled
         done = finish(
             records,
             self.config,
@@ -157,12 +166,18 @@ class NetworkBackend(Backend):
             else:
                 out = self.network(given)
         clean: FloatArray = out.cpu().numpy()
+        records = shapes = None
         if length < clean.shape[1]:
-            done = self.finished(clean, batch)
+            records, first = clean, padding(self.dt_ns)[0]
+            clean = records[:, first : first + length]
         elif self.noise is not None and batch.noise:
-            done = self.finished(with_room(clean, self.config, self.dt_ns), batch)
-        else:
-            done = Translated(clean, np.zeros(n, np.uint8), np.zeros(n, np.int64))
+            records = with_room(clean, self.config, self.dt_ns)
+        if (piled := batch.piled) is not None:
+            others, reach = clean[piled.partner], piled.reach(self.dt_ns)
+            shapes = with_room(others, self.config, self.dt_ns, reach)
+        done = Translated(clean, np.zeros(n, np.uint8), np.zeros(n, np.int64))
+        if records is not None:
+            done = self.finished(records, batch, shapes)
         if batch.trace is None:
             return done
         n_pre, length = batch.trace
@@ -178,8 +193,17 @@ class ResponseBackend(Backend):
     def translate(self, batch: Batch) -> Translated:
         """Apply the chain, add noise proportional to 1/energy, and prepare like data."""
         windows, energies, piled = batch.windows, batch.energy_kev, batch.piled
+        # early piled-up pulses need longer records
+        reach = 0 if piled is None else piled.reach(self.dt_ns)
         if batch.trace is None:
-            return self.finished(self.network(windows), batch)
+            shapes: Floats | None = None
+            if piled is not None:
+                others = np.pad(windows[piled.partner], ((0, 0), (0, reach)), mode="edge")
+                records, clean = self._clean(others)
+                scale = np.full(len(records), np.median(clean.scale))
+                scale[clean.index] = clean.scale
+                shapes = records / scale[:, np.newaxis]
+            return self.finished(self.network(windows), batch, shapes)
 
         n_pre, length = batch.trace
         assert energies is not None  # those of the pulses
@@ -188,8 +212,7 @@ class ResponseBackend(Backend):
         if batch.noise and self.noise is not None:
             noise += self.noise.draw(energies, length, batch.generator)
         if piled is not None:
-            longer = length + piled.reach(self.dt_ns)  # which early ones need
-            others = self._levels(windows[piled.partner], n_pre, longer)[0]
+            others = self._levels(windows[piled.partner], n_pre, length + reach)[0]
             levels += piled.added(np.nan_to_num(others), energies, self.dt_ns, length)
         if self.by_height is None:
             levels += noise
@@ -208,10 +231,7 @@ class ResponseBackend(Backend):
         before = max(0, n_pre - self.config.samples_before)
         after = max(0, length - n_pre - self.config.samples_after)
         # before the window no charge has moved, after it all charge has been collected
-        records = self.network(np.pad(windows, ((0, 0), (before, after)), mode="edge"))
-        # flat tops do not count as saturated
-        config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
-        clean = prepare(Pulses.of(records, dt_ns=self.dt_ns), config, "measured")
+        records, clean = self._clean(np.pad(windows, ((0, 0), (before, after)), mode="edge"))
         source = clean.align_sample[:, np.newaxis] - n_pre + np.arange(length)
         source = source.clip(0, records.shape[1] - 1)
         level = np.take_along_axis(records[clean.index], source, axis=1)
@@ -219,6 +239,12 @@ class ResponseBackend(Backend):
         baseline, scale = clean.baseline[:, np.newaxis], clean.scale[:, np.newaxis]
         levels[clean.index] = (level - baseline) / scale
         return levels, clean, n_pre + before + padding(self.dt_ns)[0]
+
+    def _clean(self, windows: FloatArray) -> tuple[FloatArray, Prepared]:
+        """Records without noise, and the same prepared; flat tops do not count as saturated."""
+        records = self.network(windows)
+        config = self.config.model_copy(update={"saturation_run": records.shape[1] + 1})
+        return records, prepare(Pulses.of(records, dt_ns=self.dt_ns), config, "measured")
 
 
 class InverseBackend(Backend):

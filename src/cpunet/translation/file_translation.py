@@ -25,6 +25,7 @@ import cpunet
 from cpunet.electronics.drawn_pile_up import Columns, DrawnTails, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
+from cpunet.networks.response_layer import padding, record_length
 from cpunet.outputs import refuse_existing
 from cpunet.processes import give_back_large_arrays
 from cpunet.progress import stage
@@ -141,7 +142,7 @@ class FileTranslation:
         if options.pile_up_khz:
             raise CpunetError(
                 "a network knows no shapes beyond its windows, so it gives no raw traces with "
-                "piled-up pulses; leave out `pile_up_khz`"
+                "piled-up pulses; leave out `pile_up_khz` or `adc`"
             )
         after = self.length - self.n_pre
         if self.n_pre > config.samples_before or after > config.samples_after:
@@ -172,17 +173,9 @@ class FileTranslation:
         }
         if self.resume and out.exists():
             return self.result(replace(finished(out, provenance), skipped=1), path=out)
-        counts, part = Counts(), self.translator.part
+        counts = Counts()
         give_back_large_arrays()
-        to = PulseWriter(
-            out,
-            table=self.options.table or f"geds/{part}",
-            waveform_units="ADC" if self.options.adc else "",
-            attrs={TRANSLATED_BY: f"cpunet {part}", "run": self.run.name},
-            samples=self.samples,
-            force=self.force,
-        )
-        with source.open() as pulses, to as writer:
+        with source.open() as pulses, self.writer(out, force=self.force) as writer:
             read_others, left_out = other_columns(pulses, OWN_COLUMNS)
             for column, reason in left_out.items():
                 log.warning(f"{source.path.name}: column {column} is left out: {reason}")
@@ -212,7 +205,19 @@ class FileTranslation:
         with source.open() as pulses:
             parts, counts = zip(*self._blocks(source, pulses, None), strict=True)
         done = TranslatedPulses.joined(parts)
-        return self.result(counts[-1], in_memory=done)
+        return self.result(counts[-1], in_memory=done, writer=self.writer)
+
+    def writer(self, out: Path, *, force: bool) -> PulseWriter:
+        """Return a writer of translated pulses."""
+        part = self.translator.part
+        return PulseWriter(
+            out,
+            table=self.options.table or f"geds/{part}",
+            waveform_units="ADC" if self.options.adc else "",
+            attrs={TRANSLATED_BY: f"cpunet {part}", "run": self.run.name},
+            samples=self.samples,
+            force=force,
+        )
 
     def _blocks(
         self, source: PulseFile, pulses: PulseSource, noise_key: str | None
@@ -249,16 +254,19 @@ class FileTranslation:
         if self.tails is not None:
             left = self.tails.draw_kev(n, generator)
             truth = {"tails_kev": (left, "keV")}
-        how: dict[str, Any] = {"noise": self.options.noise, "generator": generator}
-        if self.scale is None:
-            done = ren.translate_pulses(pulses, tails_kev=left, **how)
-            return replace(done, truth=truth)
-
         trace, rate_khz = (self.n_pre, self.length), self.options.pile_up_khz
         if rate_khz and ren.tails is not None:
-            law = rate_khz, ren.tails.energies_kev, ren.dt_ns
-            piled = InTracePileUp.draw(n, *law, *trace, generator)
+            law, record = (rate_khz, ren.tails.energies_kev, ren.dt_ns), trace
+            if self.scale is None:
+                first = padding(ren.dt_ns)[0] + self.n_pre
+                record = first, record_length(self.length, ren.dt_ns)
+            piled = InTracePileUp.draw(n, *law, *record, generator)
             truth |= piled.columns()
+        how: dict[str, Any] = {"noise": self.options.noise, "generator": generator}
+        if self.scale is None:
+            done = ren.translate_pulses(pulses, tails_kev=left, piled=piled, **how)
+            return replace(done, truth=truth)
+
         done = ren.translate_pulses(pulses, piled=piled, trace=trace, **how)
         unknown = ~(np.isfinite(energies) & (energies > 0))
         done.codes[unknown & done.valid] = Rejection.ENERGY_UNKNOWN

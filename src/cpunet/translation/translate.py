@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+import glob
 import logging
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.outputs import refuse_existing
 from cpunet.processes import outcomes
 from cpunet.progress import stage
 from cpunet.pulses.channels import Outcome, Pair, channels_of, each_channel, own_folder
+from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, Source, pulse_file
-from cpunet.training.run import INFO, Run, RunLike, used_run
+from cpunet.training.run import INFO, Run, RunLike, as_run, used_run
 from cpunet.translation.file_translation import FileTranslation, Task
 from cpunet.translation.options import NONE, Adc, TranslateOptions
 from cpunet.translation.translation import Counts, Translation
@@ -29,7 +35,7 @@ Make = Callable[[RunLike], FileTranslation]
 
 def translate(
     run: RunLike,
-    pulses: Sequence[Source] | Source,
+    pulses: Sequence[Source] | Source | npt.ArrayLike,
     out: str | Path | None = None,
     *,
     inverse: bool = False,
@@ -53,7 +59,8 @@ def translate(
     run
         A trained run or its folder; for all tables of a file, a folder of runs by table.
     pulses
-        A file of pulses, or several; from Python also pulses in memory.
+        A file of pulses, several, or patterns as ``sim_*.lh5``; or pulses in memory, or an
+        array of shape (n, samples) with the sampling of the run.
     out
         LH5 file to write; for several files, or with a slash at its end, a folder.  Without
         it, pulses stay in memory.
@@ -64,7 +71,7 @@ def translate(
     tails
         Pile-up tails: ``learned``, ``none``, or a rate in kHz.
     pile_up_khz
-        Rate in kHz of piled-up pulses within a trace in ADC counts.
+        Rate in kHz of piled-up pulses within a trace.
     adc
         Make raw traces in ADC counts, as a digitiser's, instead of normalised windows.
     scale
@@ -110,10 +117,7 @@ def translate(
         raise CpunetError(f"`jobs` is {jobs}; expected 1 or more")
     digits = scale if adc else None
     options = TranslateOptions(inverse, noise, seed, out_table, digits, tails, pile_up_khz)
-    sources = [pulses] if isinstance(pulses, Source) else pulses
-    files = [pulse_file(source, read, insist) for source in sources]
-    if not files:
-        raise CpunetError("there are no pulses to translate; give some")
+    files = [pulse_file(source, read, insist) for source in _sources(pulses, run)]
     several = len(files) > 1 or str(out).endswith("/") or (out and Path(out).is_dir())
     channels = any(file.table == ALL for file in files)
     if out is None and (several or channels):
@@ -128,6 +132,28 @@ def translate(
     if several:
         return _several(make, used_run(run), files, Path(out), jobs)
     return make(used_run(run))((files[0], Path(out), None))
+
+
+def _sources(
+    given: Sequence[Source] | Source | npt.ArrayLike, run: RunLike
+) -> Iterator[Source]:
+    """Names of files and pulses from all that a user may give."""
+    sources: list[Any] = [given] if isinstance(given, Source) else list(given)  # type: ignore[arg-type]
+    if not sources:
+        raise CpunetError("there are no pulses to translate; give some")
+    if not all(isinstance(source, Source) for source in sources):
+        waveforms = np.atleast_2d(np.asarray(given, np.float32))
+        sources = [Pulses.of(waveforms, dt_ns=as_run(run).dt_ns)]
+    for source in sources:
+        names = [source]
+        # a name with such a character may be that of a file
+        if isinstance(source, str | Path) and not Path(source).exists():
+            pattern = str(source)
+            if glob.has_magic(pattern):
+                names = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207 absolute, too
+            if not names:
+                raise CpunetError(f"{pattern}: no such files; check the name")
+        yield from names
 
 
 def _channels(make: Make, runs: RunLike, source: PulseFile, out: Path) -> Outcome[Translation]:
@@ -168,6 +194,10 @@ def _several(
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
     job, tasks = make(run), dict[Path, Task]()
+    # thousands of files are compared by their identity, and not each with each other; a file
+    # that a link among the inputs points to is one of them
+    stats = [source.path.stat() for source in sources if source.path.exists()]
+    inputs = {(stat.st_dev, stat.st_ino) for stat in stats}
     for source in sources:
         to = out / source.path.name
         to = to if to.suffix.lower() in OF_HDF5 else to.with_suffix(".lh5")
@@ -182,6 +212,8 @@ def _several(
                 f"{len(sources)}; translate them one by one"
             )
         refuse_existing(to, run.folder, *source.files, force=job.force or job.resume)
+        if to.exists() and (to.stat().st_dev, to.stat().st_ino) in inputs:
+            raise CpunetError(f"{to}: is the input; choose another `out`")
         tasks[to] = source, to, to.name
     counts, failed = Counts(), list[str]()
     # what the job says is said once: others make theirs in processes of their own

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -23,11 +24,13 @@ from cpunet.pulses.shape_parameters import (
     data_axis,
     labelled,
 )
+from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes.schema import Recipe
 from cpunet.translation.translator import TranslatedPulses
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from pandas import DataFrame
 
 DRAWN = 50  # pulses in a figure
 
@@ -71,6 +74,8 @@ class Translation:
         The file they were written to, or a folder of several; None if they are in memory only.
     in_memory
         The pulses if they are in memory.
+    writer
+        Opens a file for those in memory.
     """
 
     run: str
@@ -79,6 +84,7 @@ class Translation:
     adc: bool
     path: Path | None = None
     in_memory: TranslatedPulses | None = None
+    writer: Callable[..., PulseWriter] | None = None
 
     @cached_property
     def pulses(self) -> Pulses:
@@ -101,6 +107,11 @@ class Translation:
     def waveforms(self) -> FloatArray:
         """Translated waveforms, shape (n, samples); NaN, or 0 in ADC, in rejected rows."""
         return self.pulses.waveforms
+
+    @property
+    def valid(self) -> npt.NDArray[np.bool_]:
+        """Which rows hold a pulse, shape (n,)."""
+        return np.asarray(self.codes == Rejection.ACCEPTED)
 
     @property
     def rejections(self) -> dict[str, int]:
@@ -147,7 +158,7 @@ class Translation:
         ax
             Where to draw; a new figure of pyplot by default.
         """
-        rows, axes = np.flatnonzero(self.codes == Rejection.ACCEPTED)[:n], own_axes(ax)
+        rows, axes = np.flatnonzero(self.valid)[:n], own_axes(ax)
         pulses = self.pulses
         time_us = np.arange(pulses.length) * pulses.dt_ns * 1e-3
         lines = pulses.waveforms[rows].T
@@ -156,6 +167,29 @@ class Translation:
         axes.set_ylabel("ADC counts" if self.adc else "Normalised charge")
         axes.set_title(f"{len(rows)} of {self.counts.translated} translated pulses")
         return axes
+
+    def to_dataframe(self) -> DataFrame:
+        """Event, energy, reason of rejection and parameters of each pulse, as a data frame."""
+        columns: dict[str, Any] = {
+            "rejection": [Rejection(int(code)).label for code in self.codes]
+        }
+        columns |= {} if self.adc else self.parameters
+        return self.pulses.to_dataframe().assign(**columns)
+
+    def save(self, path: str | Path, *, force: bool = False) -> Path:
+        """Write pulses that are in memory to an LH5 file, without other columns of the source.
+
+        Raises
+        ------
+        CpunetError
+            If they are in a file, or the file exists (without `force`) or cannot be written.
+        """
+        if self.in_memory is None or self.writer is None:
+            raise CpunetError(f"{self.path}: holds these pulses already; copy it")
+        with self.writer(Path(path), force=force) as writer:
+            done = self.in_memory
+            writer.append(done.pulses, {"rejection": (done.codes, ""), **done.truth})
+        return Path(path)
 
     def __len__(self) -> int:
         return self.counts.read
