@@ -108,9 +108,9 @@ def test_a_run(home, run):
     assert list(covariance) == list(covariance.index) == list(run.fit.errors)
     errors = np.sqrt(np.diag(covariance))
     np.testing.assert_allclose(errors, list(run.fit.errors.values()))
-    values = cpunet.response(run, run).values
+    values = cpunet.compare(run, run).values
     assert (values.iloc[:, 0] == run.parameters["decay_us"]).any()
-    with pytest.raises(cpunet.CpunetError, match="a run has no scores; validate it, or"):
+    with pytest.raises(cpunet.CpunetError, match="runs and reports are not compared"):
         cpunet.compare(run, run.folder)
 
 
@@ -162,7 +162,7 @@ def test_a_seed_gives_the_same_pulses_in_memory_in_a_file_and_of_arrays(home, ru
     assert np.array_equal(kept.waveforms, stored.waveforms, equal_nan=True)
     assert (kept.codes.tolist(), kept.counts) == (stored.codes.tolist(), stored.counts)
     assert kept.rejections == {"energy_unknown": 4}
-    assert np.flatnonzero(kept.codes).tolist() == [3, N + 3, 2 * N + 3, 3 * N + 3]
+    assert np.flatnonzero(~kept.valid).tolist() == [3, N + 3, 2 * N + 3, 3 * N + 3]
     assert stored.path == tmp_path / "t.lh5"
     assert repr(kept) == f"<Translation in memory: {4 * N - 4} of {4 * N} pulses>"
     with pytest.warns(RejectionWarning):

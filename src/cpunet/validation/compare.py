@@ -18,8 +18,8 @@ from cpunet.plotting import label
 from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.pulses.two_sample import TwoSample
 from cpunet.tables import NO_VALUE, text_table, with_std
-from cpunet.training.response import FAR, outliers
-from cpunet.training.run import Run
+from cpunet.training.response import FAR, Response, outliers, response
+from cpunet.training.run import Run, RunLike
 from cpunet.validation.metrics import MAIN, QUANTITIES, SURVIVAL, Metrics, PeakScores, signed
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
 
@@ -186,11 +186,11 @@ class Comparison:
 
 
 def compare(
-    *reports: str | Path | Report,
+    *reports: RunLike | Report,
     method: str = "ren",
     out: str | Path | None = None,
     force: bool = False,
-) -> Comparison:
+) -> Comparison | Response:
     """Compare the scores of several validations, of one detector or of many.
 
     The page also has links to the reports, room for many detectors and periods, and of three
@@ -199,7 +199,8 @@ def compare(
     Parameters
     ----------
     reports
-        Folders of cpunet validate or demo, or their metrics.json; from Python also reports.
+        Folders of cpunet validate or demo, or their metrics.json. From Python also reports, or
+        runs, whose readouts are compared as by ``cpunet.response``.
     method
         Whose scores: ren, raw, rc, gauss_exp, superpulse, truth.
     out
@@ -209,8 +210,8 @@ def compare(
 
     Returns
     -------
-    Comparison
-        Scores of the runs side by side.
+    Comparison or Response
+        Scores of the runs side by side; of runs, their readouts.
 
     Raises
     ------
@@ -224,11 +225,14 @@ def compare(
 
     cpunet compare results/*/*/report --out results/index.html
     """
-    if any(isinstance(report, Run) for report in reports):
-        raise CpunetError("a run has no scores", "validate it, or compare by cpunet.response")
+    if runs := [report for report in reports if isinstance(report, Run)]:
+        if len(runs) < len(reports):
+            raise CpunetError("runs and reports are not compared", "validate the runs")
+        return response(*runs, out=out, force=force)
+    scored = [report for report in reports if not isinstance(report, Run)]
     if out is not None:
-        refuse_inputs(Path(out), *(of for of in reports if not isinstance(of, Report)))
-    comparison = compared(reports, method=method)
+        refuse_inputs(Path(out), *(of for of in scored if not isinstance(of, Report)))
+    comparison = compared(scored, method=method)
     if out is None:
         return comparison
     comparison.save(out, force=force)
