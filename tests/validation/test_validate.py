@@ -94,7 +94,13 @@ def test_what_is_compared(found) -> None:
 def test_every_figure_can_be_drawn(found) -> None:
     made = drawings(found)
     assert {"FEP mean pulse", "SEP superpulses", "SEP single pulse", "losses"} <= set(made)
+    assert {"FEP cycle of simulation", "FEP cycle of data"} <= set(made)
     assert all(draw().axes for draw in made.values())
+    weights = {n: w for n, w in found.run.weights.items() if not n.startswith("iren.")}
+    alone = found.run.model_copy(update={"weights": weights})
+    made = drawings(dataclasses.replace(found, run=alone))
+    assert "losses" in made
+    assert not any("cycle" in name for name in made)
 
 
 def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) -> None:
@@ -195,13 +201,22 @@ def report(run, files, tmp_path_factory) -> cpunet.Report:
 
 def test_a_report(report):
     assert sorted(report.values) == ["DEP", "FEP", "SEP"]
+    data = report.values["FEP"]["data"]["current_amplitude"]
+    histogram = report.hist("FEP")
+    scored = report.metrics.peaks["FEP"].parameters["current_amplitude"].axis
+    assert histogram.axes[1].size == scored.bins
+    assert histogram.axes[1].edges[[0, -1]].tolist() == [scored.low, scored.high]
+    assert histogram[{"method": "data"}].sum(flow=True) == np.isfinite(data).sum()
     compared = report.metrics.peaks["SEP"].parameters["drift_time"]
-    row = report.scores.loc["SEP", "drift_time", "ren"]
+    row = report["SEP"].loc["drift_time", "ren"]
     assert row["iou"] == compared.iou["ren"]
     assert row["ceiling"] == compared.iou["ceiling"]
+    assert report.scores.loc["SEP", "drift_time", "ren"].equals(row)
     assert "current amplitude" in report._repr_html_()
     assert repr(report).startswith(f"<Report {report.folder}: ")
     assert report.figures["FEP mean pulse"].axes
+    with pytest.raises(CpunetError, match="no scored peak '1500'; there are FEP, SEP, DEP"):
+        report["1500"]
     lines = str(report).splitlines()
     assert lines[0].startswith(("REN agrees with the data in all", "REN is off in"))
     assert "REN − data" in lines[1]
@@ -215,9 +230,10 @@ def test_a_report(report):
 def test_a_report_again(report, tmp_path):
     again = cpunet.Report.load(report.folder)
     assert again.metrics == report.metrics
-    with np.load(report.folder / "parameters.npz") as stored:
-        drift_ns = report.values["FEP"]["ren"]["drift_time"]
-        assert np.array_equal(stored["FEP/ren/drift_time"], drift_ns, equal_nan=True)
+    for method in ("data", "raw", "ren"):
+        one, other = (r.hist("FEP", "drift_time")[{"method": method}] for r in (report, again))
+        assert np.array_equal(one.values(), other.values())
+    assert again.plot("SEP", "drift_time").get_title() == "SEP"
     assert again.figures["FEP mean pulse"].name == "FEP_mean_pulse.svg"
     assert again.scores.sort_index().equals(report.scores.sort_index())
     with pytest.raises(CpunetError, match="is a report already; copy the folder"):

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import data_axis
+from cpunet.translation.translator import IREN
 from cpunet.validation import figures
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.metrics import PeakScores
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 SINGLE = ("raw", "rc", "rc_late", "ren", "truth")  # methods in the figure of a single pulse
 SLICED = ("data", "rc", "rc_late", "ren")  # and in slices
+SHOWN = 10  # pulses in a figure of cycles, as in the paper
 
 Drawing = Callable[[], Figure]
 
@@ -46,6 +48,21 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
     ae = {p.name: {m: v["current_amplitude"] for m, v in p.values.items()} for p in scored}
     if DEP in ae and len(ae) > 1:
         drawn["A over E survival"] = partial(figures.roc_figure, ae)
+    if any(name.startswith(f"{IREN.part}.") for name in run.weights):
+        # pulses of both sides of the fullest peak through both networks and back
+        fullest = max(evaluated.sets, key=lambda peak: min(map(len, peak.rows.values())))
+        iren, ren = run.iren, fullest.translations.ren
+        for forward, back, side, names in (
+            (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
+            (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
+        ):
+            start, rows = fullest.windows(side)[:SHOWN], fullest.rows[side][:SHOWN]
+            kev = fullest.translations.energy_kev[side][rows]
+            middle = forward.apply(start, energy_kev=kev, noise=False)
+            end = back.apply(middle, energy_kev=kev, noise=False)
+            stages = dict(zip(names, (start, middle, end), strict=True))
+            name = f"{fullest.name} cycle of {names[0].lower()}"
+            drawn[name] = partial(figures.cycle_figure, stages, ren.dt_ns)
     if run.records:
         drawn["losses"] = partial(figures.loss_curves, run.records)
     return drawn

@@ -30,6 +30,7 @@ from cpunet.plotting import (
     steps,
     styled,
 )
+from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import LABELLED, data_axis
 from cpunet.tables import number
@@ -98,6 +99,25 @@ def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
 
 
 @styled
+def cycle_figure(pulses: Mapping[str, FloatArray], dt_ns: float) -> Figure:
+    """Pulses through a cycle, a panel for each stage (paper, figures of the cycles).
+
+    Parameters
+    ----------
+    pulses
+        Pulses by stage, shape (n, samples); each row is the same event in all.
+    dt_ns
+        Sampling period in ns.
+    """
+    figure, (grid,) = panels((3.4 * len(pulses), 3.2), 1, len(pulses), sharex=True, sharey=True)
+    for axes, (title, windows) in zip(grid, pulses.items(), strict=True):
+        axes.plot(np.arange(windows.shape[1]) * dt_ns * 1e-3, windows.T, linewidth=0.8)
+        axes.set(title=title, xlabel="Time [µs]")
+    grid[0].set_ylabel("Normalised charge")
+    return figure
+
+
+@styled
 def parameter_histograms(
     values: Mapping[str, Values],
     axis: hist.axis.Regular,
@@ -107,42 +127,24 @@ def parameter_histograms(
 ) -> Figure:
     """Distributions of one parameter at a peak, and differences from the data in sigma.
 
-    All histograms sum to one, with the events outside the range, whose share is in the legend
-    with each method's IoU and that of data with data.
-
-    Parameters
-    ----------
-    values
-        Values of the parameter by method, the measured ones first, under ``"data"``.
-    axis
-        Binning, see `shape_parameters.data_axis`.
-    parameter, peak
-        Names of both.
-    comparison
-        Result of `comparisons.compare` for the parameter.
+    For the parameters see `draw_parameter`; `peak` is the name of the gamma line.
     """
-    figure, ((above,), (below,)) = panels((5.6, 4.0 + LINE * len(values)), 2, **STACKED)
-    counts = {method: histogram(v, axis) for method, v in values.items()}
+    height = 4.0 + LINE * len(values)
+    figure, ((axes,), (below,)) = panels((5.6, height), 2, **STACKED)
+    draw_parameter(axes, values, axis, parameter, comparison)
+    counts = {method: histogram(v, axis)[1:-2] for method, v in values.items()}
     sizes = {method: max(len(v), 1) for method, v in values.items()}
-    for method, counted in counts.items():
-        name, kind = ("ceiling", "data vs data") if method == "data" else (method, "IoU")
-        score, missing = comparison.iou.get(name), int(counted[-1])
-        text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
-        text += f", n = {len(values[method])}" + (f", {missing} undefined" if missing else "")
-        low, *shares, high, _ = counted / sizes[method]
-        if low + high >= OUTSIDE:
-            text += f", {100 * (low + high):.0f} % outside"
-        steps(above, shares, axis.edges, method, text)
+    for method in counts:
         if method != "data":
-            of_data = counts["data"] / sizes["data"]
-            common = (counted + counts["data"]) / (sizes[method] + sizes["data"])
+            share, of_data = (counts[m] / sizes[m] for m in (method, "data"))
+            common = (counts[method] + counts["data"]) / (sizes[method] + sizes["data"])
             error = np.sqrt(common * (1 / sizes[method] + 1 / sizes["data"]))
-            pull = (counted / sizes[method] - of_data) / np.where(error > 0, error, np.nan)
-            steps(below, pull[1:-2], axis.edges, method, label(method))
-    above.set_ylabel("Fraction of events per bin")
+            pull = (share - of_data) / np.where(error > 0, error, np.nan)
+            steps(below, pull, axis.edges, method, label(method))
     sigma_panel(below)
-    below.set_xlabel(LABELLED[parameter].axis_label)
-    legend_above(figure, above, title=peak)
+    below.set_xlabel(axes.get_xlabel())
+    axes.set_xlabel("")
+    legend_above(figure, axes, title=peak)
     return figure
 
 
@@ -185,6 +187,44 @@ def overlap_figure(metrics: Metrics) -> Figure:
     legend_above(figure, grid[0], 4)
     figure.subplots_adjust(bottom=0.2)  # names are longer than numbers
     return figure
+
+
+@styled
+def draw_parameter(
+    axes: Axes,
+    values: Mapping[str, Values],
+    axis: hist.axis.Regular,
+    parameter: str,
+    comparison: Compared,
+) -> None:
+    """Draw the distributions of one parameter: the data filled, each method as a line.
+
+    All histograms sum to one, with the events outside the range, whose share is in the legend
+    with each method's IoU and that of data with data.
+
+    Parameters
+    ----------
+    axes
+        Where to draw.
+    values
+        Values of the parameter by method, the measured ones under ``"data"``.
+    axis
+        Binning, see `shape_parameters.data_axis`.
+    parameter
+        Name of the parameter in `PARAMETERS`.
+    comparison
+        Result of `comparisons.compare` for the parameter.
+    """
+    for method, of_method in values.items():
+        name, kind = ("ceiling", "data vs data") if method == "data" else (method, "IoU")
+        score, missing = comparison.iou.get(name), int(np.isnan(of_method).sum())
+        text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
+        text += f", n = {len(of_method)}" + (f", {missing} undefined" if missing else "")
+        below, *shares, above, _ = histogram(of_method, axis) / max(len(of_method), 1)
+        if below + above >= OUTSIDE:
+            text += f", {100 * (below + above):.0f} % outside"
+        steps(axes, shares, axis.edges, method, text)
+    axes.set(xlabel=LABELLED[parameter].axis_label, ylabel="Fraction of events per bin")
 
 
 @styled

@@ -18,19 +18,23 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 
-from cpunet.errors import CpunetError
+from cpunet.errors import CpunetError, named
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.plotting import COLOURS, label
 from cpunet.progress import stage
 from cpunet.pulses.parameters import Values
+from cpunet.pulses.reading.other_formats import read_arrays
 from cpunet.pulses.shape_parameters import LABELLED
 from cpunet.settings import flat, read_json
 from cpunet.tables import number, text_table, with_std
 from cpunet.validation.metrics import Metrics, called
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+    from cpunet.pulses.shape_parameters import Histogram
 
 METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
 REPORT = FolderKind(
@@ -64,6 +68,8 @@ SECTIONS = (
     ("ae", "A over E survival", "survival of other peaks against that of the DEP"),
     ("ae_energy", "A over E and energy", "position and width of the A/E peak against energy"),
     ("others", "losses", "losses of the training by iteration"),
+    ("others", "cycle of simulation", "simulated pulses, their translations, and those back"),
+    ("others", "cycle of data", "measured pulses, their translations, and those back"),
     ("distributions", "", "distributions by method, and differences in standard errors"),
 )
 
@@ -72,13 +78,14 @@ SECTIONS = (
 class Report:
     """Scores of a run, as returned by `cpunet.validate`.
 
+    ``report["SEP"]`` are the scores of a peak, a row for each parameter and method.
+
     Parameters
     ----------
     metrics
         The content of ``metrics.json``; `to_dict` gives it as plain values.
     values
-        Pulse-shape parameters by peak, method and name: arrays with a value for each pulse;
-        those of a report that was opened are in its ``parameters.npz``.
+        Pulse-shape parameters by peak, method and name: arrays with a value for each pulse.
     folder
         Folder of the report; None if none was written.
     drawn
@@ -103,7 +110,12 @@ class Report:
             If the folder is not a report, or cannot be read.
         """
         remedy = "give the folder of a report, or make one with cpunet.validate"
-        return cls(read_metrics(Path(folder) / METRICS, remedy), folder=Path(folder))
+        metrics = read_metrics(Path(folder) / METRICS, remedy)
+        values: dict[str, dict[str, dict[str, Values]]] = {}
+        for key, stored in read_arrays(Path(folder) / VALUES).items():
+            peak, method, name = key.rsplit("/", 2)
+            values.setdefault(peak, {}).setdefault(method, {})[name] = stored
+        return cls(metrics, values, Path(folder))
 
     @cached_property
     def scores(self) -> DataFrame:
@@ -126,6 +138,11 @@ class Report:
         ]
         return DataFrame(rows, columns=columns).set_index(index)
 
+    def __getitem__(self, peak: str) -> DataFrame:
+        peaks = {name: name for name in self.metrics.scored}
+        selected: DataFrame = self.scores.loc[named(peaks, peak, "scored peak")]
+        return selected
+
     def to_dict(self) -> dict[str, Any]:
         """The content of ``metrics.json``."""
         return self.metrics.to_dict()
@@ -142,6 +159,79 @@ class Report:
             files = [] if self.folder is None else sorted(self.folder.glob("*.svg"))
             return {file.stem.replace("_", " "): file for file in files}
         return _Figures(self.drawn)
+
+    def hist(
+        self, peak: str, parameter: str = "current_amplitude", bins: int | None = None
+    ) -> Histogram:
+        """Distributions of a parameter by method, in the range in which it is scored.
+
+        Parameters
+        ----------
+        peak, parameter
+            Names of both.
+        bins
+            Number of bins; that of the score by default.
+
+        Returns
+        -------
+        Histogram
+            A `hist.Hist` with the axes ``method`` (categories) and the parameter.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such peak or parameter.
+        """
+        import hist
+
+        from cpunet.pulses.shape_parameters import Histogram, labelled
+
+        of_peak = named(self.values, peak, "scored peak")
+        named(of_peak["data"], parameter, "parameter")
+        scores = self.metrics.peaks[peak]
+        binning = (scores.parameters | scores.further)[parameter].axis
+        axis = hist.axis.Regular(binning.bins or 1, binning.low or 0.0, binning.high or 1.0)
+        axis = labelled(axis, parameter, bins)
+        made = Histogram(hist.axis.StrCategory(list(of_peak), name="method"), axis)
+        for method, values in of_peak.items():
+            made.fill(method, values[parameter][np.isfinite(values[parameter])])
+        return made
+
+    def plot(
+        self,
+        peak: str | None = None,
+        parameter: str = "current_amplitude",
+        ax: Axes | None = None,
+    ) -> Axes:
+        """Draw the distributions of a parameter by method, with its scores; return the axes.
+
+        Parameters
+        ----------
+        peak
+            Name of a scored peak; None for the first.
+        parameter
+            Name of a scored parameter.
+        ax
+            Where to draw; a new figure of pyplot by default.
+
+        Raises
+        ------
+        CpunetError
+            If there is no such peak, or no such parameter is scored there.
+        """
+        from cpunet.plotting import own_axes
+        from cpunet.validation.figures import draw_parameter
+
+        peak = next(iter(self.values)) if peak is None else peak
+        of_peak = named(self.values, peak, "scored peak")
+        compared = named(self.metrics.peaks[peak].parameters, parameter, "scored parameter")
+        values = {method: of_method[parameter] for method, of_method in of_peak.items()}
+        axis = self.hist(peak, parameter).axes[1]
+        ax = own_axes(ax)
+        draw_parameter(ax, values, axis, parameter, compared)
+        ax.set_title(peak)
+        ax.legend()
+        return ax
 
     def save(self, folder: str | Path, force: bool = False) -> None:
         """Write the report to a folder: page, metrics, values and figures.
