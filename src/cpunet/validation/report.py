@@ -15,16 +15,17 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import hist
 import numpy as np
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError, named
 from cpunet.outputs import FolderKind, folder_written_aside
-from cpunet.plotting import COLOURS, label
+from cpunet.plotting import COLOURS, label, own_axes
 from cpunet.progress import stage
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.reading.other_formats import read_arrays
-from cpunet.pulses.shape_parameters import LABELLED
+from cpunet.pulses.shape_parameters import LABELLED, Histogram, labelled
 from cpunet.settings import flat, read_json
 from cpunet.tables import number, text_table, with_std
 from cpunet.validation.metrics import Metrics, called
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
-
-    from cpunet.pulses.shape_parameters import Histogram
 
 METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
 REPORT = FolderKind(
@@ -182,10 +181,6 @@ class Report:
         CpunetError
             If there is no such peak or parameter.
         """
-        import hist
-
-        from cpunet.pulses.shape_parameters import Histogram, labelled
-
         of_peak = named(self.values, peak, "scored peak")
         named(of_peak["data"], parameter, "parameter")
         scores = self.metrics.peaks[peak]
@@ -219,7 +214,6 @@ class Report:
         CpunetError
             If there is no such peak, or no such parameter is scored there.
         """
-        from cpunet.plotting import own_axes
         from cpunet.validation.figures import draw_parameter
 
         peak = next(iter(self.values)) if peak is None else peak
