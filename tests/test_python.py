@@ -233,7 +233,7 @@ NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e-\d+)?")
 def require_alike(printed: str, shown: str) -> None:
     """The same words; numbers as near as those of another processor."""
     words = [
-        " ".join(re.sub(r"[+-]?#", "#", NUMBER.sub("#", t)).split()) for t in (printed, shown)
+        " ".join(re.sub(r"[+−-]?#", "#", NUMBER.sub("#", t)).split()) for t in (printed, shown)
     ]
     assert words[0] == words[1]
     numbers = [[float(n) for n in NUMBER.findall(text)] for text in (printed, shown)]

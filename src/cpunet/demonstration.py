@@ -54,6 +54,6 @@ def demo(
     assert isinstance(report, cpunet.Report)
     if quick:
         drawn = {name: draw for name, draw in (report.drawn or {}).items() if name in GLANCE}
-        report = replace(report, drawn=drawn, notes=(QUICK_LOOK, *report.notes))
+        report = replace(report, drawn=drawn, notes=(QUICK_LOOK,))
     report.save(in_report, force=force)
     return replace(report, folder=in_report)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeAlias
 
@@ -88,11 +89,18 @@ def percent(value: float) -> str:
     return f"{value:.2g} %" if abs(value) < 99.5 else f"{value:.0f} %"
 
 
-def number(value: Any) -> str:
-    """Format a value for the page: four digits suffice to compare two scores."""
+def number(value: Any, form: str = ".4g") -> str:
+    """Format a value with a true minus sign; four digits suffice to compare two scores.
+
+    Examples
+    --------
+    >>> number(-0.52094), number(-0.52094, "+.1f"), number(7), number(None)
+    ('−0.5209', '−0.5', '7', '–')
+    """
     if value is None:
         return NO_VALUE
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    text = f"{value:{form}}" if isinstance(value, float) else str(value)
+    return re.sub(r"^-", "−", text)
 
 
 def with_std(value: Any, error: Any) -> str:
@@ -100,8 +108,8 @@ def with_std(value: Any, error: Any) -> str:
 
     Examples
     --------
-    >>> with_std(0.52094, 0.0171), with_std(0.52094, 0.0996), with_std(0.1, None)
-    ('0.521 ± 0.017', '0.52 ± 0.10', '0.1')
+    >>> with_std(0.52094, 0.0171), with_std(-0.52094, 0.0996), with_std(0.1, None)
+    ('0.521 ± 0.017', '−0.52 ± 0.10', '0.1')
     """
     if value is None or error is None:
         return number(value)
@@ -111,4 +119,4 @@ def with_std(value: Any, error: Any) -> str:
     digits = max(1 - exponent, 0)
     if digits >= MAX_DIGITS:
         return f"{number(value)} ± {error if seen else 0:.2g}"
-    return f"{value:.{digits}f} ± {error:.{digits}f}"
+    return f"{number(float(value), f'.{digits}f')} ± {error:.{digits}f}"

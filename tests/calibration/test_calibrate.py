@@ -95,7 +95,7 @@ def test_it_is_a_run_like_any_other(calibrated, stand):
     assert run.detector.temperature_K == physics["value"]
     assert physics["prior_error"] > 0
     assert run.settings.dt_ns == run.dt_ns
-    assert cpunet.translate(run, run.simulation).valid.any()
+    assert run.translate(run.simulation).valid.any()
     assert {"pulls", "directions"} == set(run.figures)
     html = run._repr_html_()
     assert "temperature [K]" in html

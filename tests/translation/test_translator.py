@@ -52,17 +52,6 @@ def test_prepared_pulses_are_not_prepared_again(request, recipe, sim, data, side
         np.testing.assert_allclose(other, expected, atol=1e-4)
 
 
-def test_sets_keep_their_rows(ren, sim):
-    pulses = Pulses.of(
-        sim, dt_ns=16, energy_kev=[1, 2, 3, 4, 5], event_number=[10, 20, 30, 40, 50]
-    )
-    done = ren.translate_pulses(pulses, generator=np.random.default_rng(6))
-    assert np.array_equal(done.pulses.waveforms, ren.translate(sim, seed=6))
-    assert done.pulses.event_number.tolist() == [10, 20, 30, 40, 50]
-    assert done.pulses.energy_kev.tolist() == [1, 2, 3, 4, 5]
-    assert done.valid.all()
-
-
 def test_pulses_that_cannot_be_translated_are_nan_and_counted(ren, sim):
     broken = sim.copy()
     broken[1, 7] = np.nan

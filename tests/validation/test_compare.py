@@ -67,7 +67,7 @@ def test_rows_and_what_they_show():
         ["80.0 ± 2.5 (88.0)", "85.0 ± 2.5 (88.0)*"],
         ["0.520 ± 0.020*", "0.450 ± 0.020"],  # the first is closer to chance
         ["0.600*", "0.600*"],
-        ["+1.0 ± 2.0", "-0.5 ± 2.0*"],
+        ["+1.0 ± 2.0", "−0.5 ± 2.0*"],
     ]
     assert table.note == ""
     assert table.scores.loc["SEP", "edge RMSE [10⁻³]"].tolist() == [0.6, 0.6]

@@ -12,7 +12,8 @@ from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
 from cpunet.training.figures import sides_figure
 from cpunet.validation import figures
 from cpunet.validation.comparisons import compare
-from cpunet.validation.figures import nearest, shape_figure
+from cpunet.validation.drawings import nearest
+from cpunet.validation.figures import shape_figure
 from cpunet.validation.peaks import MeanPulse, around_half
 from synthetic import LOSS_NAMES, load_recipe, require_drawn
 

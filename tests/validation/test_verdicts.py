@@ -72,7 +72,7 @@ def test_an_agreement_is_quoted_with_its_sensitivity():
     assert metrics().summary("SEP") == (
         "REN, SEP: drift time off by 3.9 sigma (+5.0 ± 2.0 ns, p = 0.0001); agreement in "
         "current amplitude (+1.00 ± 0.40 %, p = 0.5), tail slope (+5.0 ± 2.0 1/ms, p = 0.9), "
-        "classifier (AUC 0.510 ± 0.020, 0.50 expected, p = 0.31), A/E survival (-9.5 ± 5.0 "
+        "classifier (AUC 0.510 ± 0.020, 0.50 expected, p = 0.31), A/E survival (−9.5 ± 5.0 "
         "points, p = 0.057)"
     )
 

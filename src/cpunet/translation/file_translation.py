@@ -51,6 +51,10 @@ from cpunet.translation.translator import (
 
 log = logging.getLogger(__name__)
 
+# a file, its output, and a name that is combined with the seed, so that the noise of files or
+# channels differs; None for the noise of `Translator.translate`
+Task = tuple[PulseFile, Path, str | None]
+
 HIGHEST = int(np.iinfo(np.uint16).max)
 RISE_NS = 320.0  # of the pulse whose height defines the gain
 MIN_ADC = 20.0  # raw traces have a larger median scale
@@ -147,23 +151,11 @@ class FileTranslation:
                 "baseline and decay without noise"
             )
 
-    def __call__(
-        self, source: PulseFile, out: Path, noise_key: str | None = None
-    ) -> Translation:
+    def __call__(self, task: Task) -> Translation:
         """Translate a file, block by block, with its rows and other columns.
 
         Pulses that cannot be translated become rows of NaN (of 0 in ADC); the column
         ``rejection`` contains the reason (0: translated).
-
-        Parameters
-        ----------
-        source
-            Simulated pulses, or measured ones for the inverse.
-        out
-            LH5 file to write.
-        noise_key
-            Name that is combined with the seed, so that the noise of files or channels
-            differs; None for the noise of `cpunet.translation.translator.Translator.translate`.
 
         Raises
         ------
@@ -171,12 +163,11 @@ class FileTranslation:
             If source or output cannot be used, no pulse can be translated, the source changes
             meanwhile, or another process writes the same output.
         """
-        anyway = self.force or self.resume
-        refuse_existing(out, self.run.folder, *source.files, force=anyway)
-        before = source_print(source)
+        source, out, noise_key = task
+        refuse_existing(out, self.run.folder, *source.files, force=self.force or self.resume)
         made_by = f"{self.run.weights_sha256}{self.run.recipe!r}"
-        provenance = {
-            "source": before,
+        provenance: dict[str, Any] = {
+            "source": source_print(source),
             "run": hashlib.sha256(made_by.encode()).hexdigest(),
             "options": asdict(self.options) | {"noise_key": noise_key},
         }
@@ -193,7 +184,7 @@ class FileTranslation:
                 others = read_others(counts.read - n, n)
                 columns = {"rejection": (block.codes, ""), **block.truth, **others}
                 writer.append(block.pulses, columns)
-            if source_print(source) != before:
+            if source_print(source) != provenance["source"]:
                 raise CpunetError(
                     f"{source.path}: changed while it was read; translate it once it is "
                     "complete"
@@ -258,29 +249,25 @@ class FileTranslation:
 
     def translated(self, pulses: Pulses, generator: np.random.Generator) -> TranslatedPulses:
         """Windows of pulses, NaN for rejected ones, or traces in ADC counts, 0 for these."""
-        n, dt_ns, rate_khz = len(pulses), self.translator.dt_ns, self.options.pile_up_khz
-        record = self.n_pre, self.length
-        if self.scale is None:
-            record = padding(dt_ns)[0] + self.n_pre, record_length(self.length, dt_ns)
+        ren, n, energies = self.translator, len(pulses), pulses.energy_kev
         left, piled, truth = None, None, Columns()
         if self.tails is not None:
             left = self.tails.draw_kev(n, generator)
             truth = {"tails_kev": (left, "keV")}
-        if rate_khz and (learned := self.translator.tails) is not None:
-            sizes = learned.energies_kev
-            piled = InTracePileUp.draw(n, rate_khz, sizes, dt_ns, *record, generator)
+        trace, rate_khz = (self.n_pre, self.length), self.options.pile_up_khz
+        if rate_khz and ren.tails is not None:
+            law, record = (rate_khz, ren.tails.energies_kev, ren.dt_ns), trace
+            if self.scale is None:
+                first = padding(ren.dt_ns)[0] + self.n_pre
+                record = first, record_length(self.length, ren.dt_ns)
+            piled = InTracePileUp.draw(n, *law, *record, generator)
             truth |= piled.columns()
-        translate = partial(
-            self.translator.translate_pulses,
-            pulses,
-            noise=self.options.noise,
-            generator=generator,
-            piled=piled,
-        )
+        how: dict[str, Any] = {"noise": self.options.noise, "generator": generator}
         if self.scale is None:
-            return replace(translate(tails_kev=left), truth=truth)
+            done = ren.translate_pulses(pulses, tails_kev=left, piled=piled, **how)
+            return replace(done, truth=truth)
 
-        done, energies = translate(trace=(self.n_pre, self.length)), pulses.energy_kev
+        done = ren.translate_pulses(pulses, piled=piled, trace=trace, **how)
         unknown = ~(np.isfinite(energies) & (energies > 0))
         done.codes[unknown & done.valid] = Rejection.ENERGY_UNKNOWN
         levels = done.pulses.waveforms
@@ -341,10 +328,7 @@ def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]
         time = np.arange(config.length) - config.samples_before
         ramp = np.clip(time * translator.dt_ns / RISE_NS + 1, 0, 1).astype(np.float32)
         pulse = translator.apply(ramp[np.newaxis], energy_kev=np.ones(1), noise=False)
-        height = float(pulse.max())
-        if not (np.isfinite(height) and height > 0):
-            raise CpunetError("the run cannot translate a fast pulse; train again")
-        per_kev = adc.adc_per_kev / height
+        per_kev = adc.adc_per_kev / float(pulse.max())
     if per_kev is None:
         raise CpunetError(
             f"{run.name}: does not say how many ADC counts a keV is; give `adc_per_kev`"

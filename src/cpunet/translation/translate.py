@@ -22,7 +22,7 @@ from cpunet.pulses.channels import Outcome, Pair, channels_of, each_channel, own
 from cpunet.pulses.container import Pulses
 from cpunet.pulses.reading.files import ALL, FileOptions, PulseFile, Source, pulse_file
 from cpunet.training.run import INFO, Run, RunLike, as_run, used_run
-from cpunet.translation.file_translation import FileTranslation
+from cpunet.translation.file_translation import FileTranslation, Task
 from cpunet.translation.options import NONE, Adc, TranslateOptions
 from cpunet.translation.translation import Counts, Translation
 
@@ -31,7 +31,6 @@ log = logging.getLogger(__name__)
 OF_HDF5 = (".lh5", ".h5", ".hdf5", ".hdf")
 
 Make = Callable[[RunLike], FileTranslation]
-Task = tuple[PulseFile, Path, str]  # a file, its output, and the name of its noise
 
 
 def translate(
@@ -118,7 +117,7 @@ def translate(
         raise CpunetError(f"`jobs` is {jobs}; expected 1 or more")
     digits = scale if adc else None
     options = TranslateOptions(inverse, noise, seed, out_table, digits, tails, pile_up_khz)
-    files = list(_files(pulses, read, insist, run))
+    files = [pulse_file(source, read, insist) for source in _sources(pulses, run)]
     several = len(files) > 1 or str(out).endswith("/") or (out and Path(out).is_dir())
     channels = any(file.table == ALL for file in files)
     if out is None and (several or channels):
@@ -132,16 +131,13 @@ def translate(
         return _channels(make, run, files[0], Path(out))
     if several:
         return _several(make, used_run(run), files, Path(out), jobs)
-    return make(used_run(run))(files[0], Path(out))
+    return make(used_run(run))((files[0], Path(out), None))
 
 
-def _files(
-    given: Sequence[Source] | Source | npt.ArrayLike,
-    read: FileOptions,
-    insist: bool,
-    run: RunLike,
-) -> Iterator[PulseFile]:
-    """Files of pulses from all that a user may give."""
+def _sources(
+    given: Sequence[Source] | Source | npt.ArrayLike, run: RunLike
+) -> Iterator[Source]:
+    """Names of files and pulses from all that a user may give."""
     sources: list[Any] = [given] if isinstance(given, Source) else list(given)  # type: ignore[arg-type]
     if not sources:
         raise CpunetError("there are no pulses to translate; give some")
@@ -157,7 +153,7 @@ def _files(
                 names = sorted(glob.glob(pattern, recursive=True))  # noqa: PTH207 absolute, too
             if not names:
                 raise CpunetError(f"{pattern}: no such files; check the name")
-        yield from (pulse_file(name, read, insist) for name in names)
+        yield from names
 
 
 def _channels(make: Make, runs: RunLike, source: PulseFile, out: Path) -> Outcome[Translation]:
@@ -178,7 +174,7 @@ def _channels(make: Make, runs: RunLike, source: PulseFile, out: Path) -> Outcom
 
 def _channel(make: Make, runs: RunLike, name: str, pair: Pair, place: Path) -> Translation:
     run = used_run(runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO))
-    return make(run)(pair[0], place.with_name(f"{name}.lh5"), name)
+    return make(run)((pair[0], place.with_name(f"{name}.lh5"), name))
 
 
 def _several(
@@ -198,7 +194,8 @@ def _several(
     if out.exists() and not out.is_dir():
         raise CpunetError(f"{out}: is a file, but several outputs need a folder")
     job, tasks = make(run), dict[Path, Task]()
-    # thousands of files are compared by their identity, and not each with each other
+    # thousands of files are compared by their identity, and not each with each other; a file
+    # that a link among the inputs points to is one of them
     stats = [source.path.stat() for source in sources if source.path.exists()]
     inputs = {(stat.st_dev, stat.st_ino) for stat in stats}
     for source in sources:
@@ -220,7 +217,7 @@ def _several(
         tasks[to] = source, to, to.name
     counts, failed = Counts(), list[str]()
     # what the job says is said once: others make theirs in processes of their own
-    begin = partial(_worker, partial(make, run) if jobs > 1 else lambda: job)
+    begin = partial(make, run) if jobs > 1 else lambda: job
     with (
         stage("Translating", len(tasks)) as bar,
         closing(outcomes(begin, [*tasks.values()], jobs, once=True)) as results,
@@ -233,7 +230,7 @@ def _several(
                 failed.append(text if named else f"{source.path}: {text}")
                 log.error(failed[-1])
             else:
-                counts += outcome
+                counts += outcome.counts
     if failed:
         done = len(tasks) - len(failed)
         others = f"; {done} are in {out}" if done else ""
@@ -242,9 +239,3 @@ def _several(
             "continue with `resume`"
         )
     return job.result(replace(counts, files=len(tasks)), path=out)
-
-
-def _worker(make: Callable[[], FileTranslation]) -> Callable[[Task], Counts]:
-    """Return a function that translates a file after the other."""
-    job = make()
-    return lambda task: job(*task).counts

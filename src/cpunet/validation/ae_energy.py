@@ -148,9 +148,7 @@ def against_energy(
     single_site += [(low, low + WIDTH_KEV) for low in lows]
     others = [span for span in lines if span not in single_site]
     fits: dict[str, dict[Range, SiteFit]] = {method: {} for method in amplitude}
-    about: dict[
-        str, tuple[float, float]
-    ] = {}  # the double-escape peak, the first, guides others
+    about: dict[str, tuple[float, float]] = {}  # the first range guides the others
     common: set[Range] = set()
     for bands in (single_site, others):
         for method, values in amplitude.items():

@@ -20,14 +20,7 @@ from cpunet.pulses.two_sample import TwoSample
 from cpunet.tables import NO_VALUE, text_table, with_std
 from cpunet.training.response import FAR, Response, outliers, response
 from cpunet.training.run import Run, RunLike
-from cpunet.validation.metrics import (
-    MAIN,
-    QUANTITIES,
-    SURVIVAL,
-    Metrics,
-    PeakScores,
-    signed,
-)
+from cpunet.validation.metrics import MAIN, QUANTITIES, SURVIVAL, Metrics, PeakScores, signed
 from cpunet.validation.report import METRICS, PAGE, Report, read_metrics
 
 if TYPE_CHECKING:
@@ -96,8 +89,7 @@ class Comparison:
     @cached_property
     def rows(self) -> list[Row]:
         """Scores that any run has, ordered by peak."""
-        rows = []
-        metrics = [report.metrics for report in self.reports.values()]
+        rows, metrics = [], [report.metrics for report in self.reports.values()]
         for peak in _union(of_run.peaks for of_run in metrics):
             collected = [_scores(of_run, peak, self.method) for of_run in metrics]
             for title in _union(collected):
@@ -108,10 +100,7 @@ class Comparison:
                 over = NO_VALUE
                 if len(present) > 1:
                     over = with_std(np.median(numbers), np.std(numbers, ddof=1))
-                texts = [
-                    f"{cell[2]}{'*' * (cell[3] == least)}" if cell else NO_VALUE
-                    for cell in cells
-                ]
+                texts = [f"{c[2]}{'*' * (c[3] == least)}" if c else NO_VALUE for c in cells]
                 far = outliers(values, [cell and cell[1] for cell in cells])
                 rows.append(Row(peak, title, values, texts, far, over))
         return rows

@@ -2,17 +2,12 @@
 
 Only matplotlib's object-oriented interface is used.  Without global state, figures can be
 made in worker processes and notebooks alike.  The caller saves them.
-
-It is unknown which simulated and which measured pulses come from the same position.  A
-simulated pulse is therefore shown with the measured pulse nearest to its translation.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from functools import partial
-from itertools import pairwise
-from typing import TYPE_CHECKING, Any
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import hist
 import numpy as np
@@ -38,16 +33,13 @@ from cpunet.plotting import (
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import LABELLED, data_axis
-from cpunet.translation.translator import IREN
+from cpunet.tables import number
 from cpunet.validation.a_over_e import DEP
 from cpunet.validation.ae_energy import REFERENCE_KEV, Course, columns
 from cpunet.validation.comparisons import Compared, finite_values, histogram
-from cpunet.validation.metrics import QUANTITIES, Metrics, PeakScores
+from cpunet.validation.metrics import QUANTITIES, Metrics
 from cpunet.validation.noise import Spectrum
-from cpunet.validation.peaks import BEFORE_NS, MeanPulse, PeakSets, around_half, sliced
-
-if TYPE_CHECKING:
-    from cpunet.validation.validate import Evaluation
+from cpunet.validation.peaks import BEFORE_NS, MeanPulse
 
 AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is stated
@@ -55,11 +47,6 @@ SIGMAS, PERCENT = 8.0, 3.0  # range of differences in standard errors, and of fu
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
-SINGLE = ("raw", "rc", "rc_late", "ren", "truth")  # methods in the figure of a single pulse
-SLICED = ("data", "rc", "rc_late", "ren")  # and in slices
-SHOWN = 10  # pulses in a figure of cycles, as in the paper
-
-Drawing = Callable[[], Figure]
 
 
 @styled
@@ -222,7 +209,7 @@ def draw_parameter(
     values
         Values of the parameter by method, the measured ones under ``"data"``.
     axis
-        Binning, see `comparisons.data_axis`.
+        Binning, see `shape_parameters.data_axis`.
     parameter
         Name of the parameter in `PARAMETERS`.
     comparison
@@ -323,42 +310,6 @@ def shape_figure(
     return figure
 
 
-def nearest(aligned: FloatArray, target: FloatArray) -> tuple[int, float]:
-    """The pulse with the smallest RMS difference from another, both aligned at half maximum.
-
-    Noise contributes to the difference.  Pulses with less than half of the compared samples
-    in their record are left out.
-
-    Parameters
-    ----------
-    aligned
-        Pulses to choose from, see `around_half`, shape ``(n, samples)``.
-    target
-        Aligned pulse to compare with, shape ``(samples,)``.
-
-    Returns
-    -------
-    tuple
-        Row of the pulse, and its RMS difference in pulse heights.
-
-    Examples
-    --------
-    >>> from cpunet.validation.peaks import around_half
-    >>> time = np.arange(400.0)
-    >>> pulses = np.array([1 / (1 + np.exp((200 - time) / width)) for width in (2, 5, 9)])
-    >>> aligned = around_half(pulses, dt_ns=16)
-    >>> nearest(aligned, aligned[1])[0]
-    1
-    """
-    offset = np.square(aligned - target.astype(float))
-    is_finite = np.isfinite(offset)
-    mean = np.where(is_finite, offset, 0).sum(axis=1) / np.maximum(is_finite.sum(axis=1), 1)
-    enough = np.isfinite(aligned).sum(axis=1) >= 0.5 * np.isfinite(target).sum()
-    squares = np.where(enough & is_finite.any(axis=1), mean, np.inf)
-    row = int(squares.argmin())
-    return row, float(np.sqrt(squares[row]))
-
-
 @styled
 def roc_figure(ae: Mapping[str, Mapping[str, Values]]) -> Figure:
     """Survival of other peaks after low-A/E cuts, against the survival of the DEP.
@@ -402,16 +353,15 @@ def ae_energy_figure(methods: Mapping[str, Course]) -> Figure:
     """
     figure, ((above,), (below,)) = panels((6.4, 5.6), 2, **STACKED)
     for method, course in methods.items():
-        colour, line = COLOURS[method], course.mean
+        line, look = course.mean, {"linestyle": "none", "markersize": 3.5}
         energy, mean, error, sigma, sigma_error = columns(course.points)
-        look = {"linestyle": "none", "markersize": 3.5}
         shift, scaled = 100 * (mean / course.scale - 1), 100 * error / course.scale
         points(above, energy, shift, scaled, method, **look)
         points(below, energy, 100 * sigma / mean, 100 * sigma_error / mean, method, **look)
         along = np.linspace(energy.min(), energy.max(), 100)
-        text = f"{label(method)}: {line.per_mev_percent:+.3f} ± "
+        text = f"{label(method)}: {number(line.per_mev_percent, '+.3f')} ± "
         text += f"{line.per_mev_error_percent:.3f} % per MeV"
-        fit = {"color": colour, "gid": GROUP + method}
+        fit = {"color": COLOURS[method], "gid": GROUP + method}
         above.plot(along, 100 * (line.a * along + line.b - 1), label=text, **fit)
         below.plot(along, 100 * course.resolution.of(along), **fit)
     above.set_ylabel(f"A/E over that at {REFERENCE_KEV:g} keV, − 1 [%]")
@@ -456,79 +406,3 @@ def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
         axis.set_minor_formatter("")
     below.set(xlabel="Frequency [MHz]", ylabel="Method / data")
     return figure
-
-
-def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
-    """Functions that draw the figures of a validation, by name; they hold what they draw."""
-    drawn: dict[str, Drawing] = {}
-    metrics, run = evaluated.metrics, evaluated.run
-    if metrics.held_out:
-        drawn["overlap with data"] = partial(overlap_figure, metrics)
-    if courses := metrics.ae_energy.methods:
-        drawn["A over E and energy"] = partial(ae_energy_figure, courses)
-    scored = [peak for peak in evaluated.sets if peak.values]
-    for peak in scored:
-        of_peak = _of_peak(peak, metrics.peaks[peak.name])
-        drawn |= {f"{peak.name} {what}": draw for what, draw in of_peak}
-    ae = {p.name: {m: v["current_amplitude"] for m, v in p.values.items()} for p in scored}
-    if DEP in ae and len(ae) > 1:
-        drawn["A over E survival"] = partial(roc_figure, ae)
-    if any(name.startswith(f"{IREN.part}.") for name in run.weights):
-        # pulses of both sides of the fullest peak through both networks and back
-        fullest = max(evaluated.sets, key=lambda peak: min(map(len, peak.rows.values())))
-        iren, ren = IREN.of(run), fullest.translations.ren
-        for forward, back, side, names in (
-            (ren, iren, "raw", ("Simulation", "REN", "IREN of REN")),
-            (iren, ren, "data", ("Data", "IREN", "REN of IREN")),
-        ):
-            start, rows = fullest.windows(side)[:SHOWN], fullest.rows[side][:SHOWN]
-            kev = fullest.translations.energy_kev[side][rows]
-            middle = forward.apply(start, energy_kev=kev, noise=False)
-            end = back.apply(middle, energy_kev=kev, noise=False)
-            stages = dict(zip(names, (start, middle, end), strict=True))
-            name = f"{fullest.name} cycle of {names[0].lower()}"
-            drawn[name] = partial(cycle_figure, stages, ren.dt_ns)
-    if run.records:
-        drawn["losses"] = partial(loss_curves, run.records)
-    return drawn
-
-
-def _of_peak(peak: PeakSets, scores: PeakScores) -> Iterator[tuple[str, Drawing]]:
-    ren, name, values = peak.translations.ren, peak.name, peak.values
-    dt_ns, bins = ren.dt_ns, ren.recipe.scores.max_bins
-    further: dict[str, dict[str, Values]] = {}
-    for parameter, data in values["data"].items():
-        by_method = {m: v[parameter] for m, v in values.items()}
-        if not np.isfinite(data).any():
-            continue
-        if parameter in scores.judged:
-            how = (by_method, data_axis(data, bins), parameter, name, scores.judged[parameter])
-            yield parameter.replace("_", " "), partial(parameter_histograms, *how)
-        else:
-            further[parameter] = by_method
-    yield "further parameters", partial(further_histograms, further, bins, name)
-    rise_time = {method: v["rise_01_90"] for method, v in values.items()}
-    edges, means = sliced(peak.windows, rise_time, dt_ns)
-    whole = {"": {method: of_method[0] for method, of_method in means.items()}}
-    yield "mean pulse", partial(shape_figure, whole, dt_ns, f"{name}: mean pulse")
-    columns = {
-        f"{low:.0f} … {high:.0f} ns": {m: means[m][i] for m in SLICED if m in means}
-        for i, (low, high) in enumerate(pairwise(edges), start=1)
-    }
-    title = f"{name}: superpulses in slices of rise time 1–90 %"
-    yield "superpulses", partial(shape_figure, columns, dt_ns, title)
-    for row in peak.known_to_all():
-        windows = peak.translations.without_noise(row)
-        shapes = {m: around_half(windows[m], dt_ns)[0] for m in SINGLE if m in windows}
-        if all(np.isfinite(shape).any() for shape in shapes.values()):
-            measured = around_half(peak.windows("data"), dt_ns)
-            place, rms = nearest(measured, shapes["ren"])
-            shapes = {"data": measured[place]} | shapes
-            pulses = {m: MeanPulse(s, np.full(len(s), np.nan), 1) for m, s in shapes.items()}
-            title = f"{name}: a simulated pulse without noise, and the measured pulse\n"
-            title += f"nearest to its REN translation (RMS difference {rms:.4f})"
-            yield "single pulse", partial(shape_figure, {"": pulses}, dt_ns, title)
-            break
-    if not scores.noise["data"].missing:
-        noise = {m: scores.noise[m] for m in ("data", "ren")}
-        yield "noise", partial(spectrum_of_noise, noise, name)

@@ -24,7 +24,7 @@ from cpunet.plotting import label
 from cpunet.pulses.parameters import PARAMETERS
 from cpunet.pulses.shape_parameters import A_OVER_E, LABELLED
 from cpunet.pulses.two_sample import SHUFFLES, TwoSample
-from cpunet.tables import NO_VALUE, with_std
+from cpunet.tables import NO_VALUE, number, with_std
 from cpunet.validation.a_over_e import RangeSurvival, SurvivalRow
 from cpunet.validation.ae_energy import AgainstEnergy
 from cpunet.validation.comparisons import Compared, Missing, Number, Result
@@ -43,7 +43,6 @@ MAIN = (A_OVER_E, "rise_time", "tail_slope", "lq")
 RIVALS = ("rc", "rc_late")
 
 SURVIVAL, _AUC, _NOISE, _SPECTRUM = "ae_survival", "auc", "noise", "noise_spectrum"
-_SHORT = {"ren": "REN", "iren": "IREN"}
 QUANTITIES = {
     A_OVER_E: "A/E",
     "current_amplitude": "A",
@@ -242,7 +241,7 @@ class Metrics(Result):
         scores, verdicts = self.peaks[peak], {}
         for name, compared in scores.judged.items():
             difference, error = compared.shift.get(method), compared.shift_std.get(method)
-            mean = "–" if compared.mean is None else f"{compared.mean:#.4g}"
+            mean = number(compared.mean, "#.4g")
             words, unit, scale = "", LABELLED[name].unit, 1.0
             if name == "current_amplitude" and compared.mean:
                 unit, scale = "%", 100 / compared.mean
@@ -340,8 +339,8 @@ class Metrics(Result):
             for name, v in verdicts.items()
             if v.p is None or (v.agrees and v.words != "agrees")
         ]
-        head = f"{_SHORT.get(method, label(method))}, {peak}"
-        return f"{head}: {'; '.join(parts) or 'not scored'}"
+        name = "REN" if method == "ren" else label(method)
+        return f"{name}, {peak}: {'; '.join(parts) or 'not scored'}"
 
     def main_table(self, peaks: Sequence[str]) -> tuple[list[str], list[list[str]]]:
         """Differences from the data with errors and p, by peak and quantity.
@@ -392,7 +391,7 @@ def two_sided(value: float | None, error: float | None) -> float | None:
 def signed(value: float | None, error: float | None) -> str:
     """A difference with its sign and error."""
     text = with_std(value, error)
-    return text if value is None or text.startswith("-") else f"+{text}"
+    return text if value is None or text.startswith("−") else f"+{text}"
 
 
 def called(quantity: str) -> str:

@@ -36,12 +36,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.pulses.container import FloatArray, Pulses
-from cpunet.pulses.parameters import (
-    PARAMETERS,
-    Values,
-    align_half_maximum,
-    pulse_parameters,
-)
+from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
 from cpunet.pulses.two_sample import LARGEST, TwoSample, classifier_auc
@@ -187,6 +182,13 @@ class PeakSets:
         rows = self.rows["raw"]
         return rows[self.translations.comparable[rows]]
 
+    def some(self, most: int) -> Pulses:
+        """Simulated pulses of at most so many translated events, spread over all."""
+        rows, of_all = self.rows["ren"], self.translations
+        rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), most)).astype(int)]
+        kev, windows = of_all.energy_kev["ren"][rows], of_all.windows["raw"][rows]
+        return Pulses.of(windows, dt_ns=of_all.ren.dt_ns, energy_kev=kev)
+
 
 def score_peak(
     peak: PeakSets,
@@ -282,13 +284,12 @@ def fit_ends(run: Run, ren: REN) -> Ends:
         return []
     ends = []
     for pair in error_ends(ren.backend.network.response, run.fit.covariance):
-        both = []
-        for response in pair:
-            moved, backend = copy.copy(ren), copy.copy(ren.backend)
-            moved.backend, backend.network = backend, copy.copy(ren.backend.network)
-            backend.network.response = response
-            both.append(moved)
-        ends.append((both[0], both[1]))
+        both = copy.copy(ren), copy.copy(ren)
+        for moved, response in zip(both, pair, strict=True):
+            moved.backend = copy.copy(ren.backend)
+            moved.backend.network = network = copy.copy(ren.backend.network)
+            network.response = response
+        ends.append(both)
     return ends
 
 
@@ -313,19 +314,16 @@ def classifier_excess(peak: PeakSets, ends: Ends, seed: int) -> float:
     seed
         Seed of the noise, the draws and the folds.
     """
-    of_all, rows = peak.translations, peak.rows["ren"]
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), LARGEST)).astype(int)]
-    kev, recipe, dt_ns = of_all.energy_kev["ren"][rows], of_all.ren.recipe, of_all.ren.dt_ns
-    raw = Pulses.of(of_all.windows["raw"][rows], dt_ns=dt_ns, energy_kev=kev)
+    raw, nominal = peak.some(LARGEST), peak.translations.ren
 
     def translated(ren: REN, noise: int) -> FloatArray:
         return like_data(ren, raw, np.random.default_rng([seed, noise]))
 
     def chief(windows: FloatArray) -> dict[str, Values]:
-        pulses = Pulses.of(windows, dt_ns=dt_ns)
+        pulses, recipe = raw.with_waveforms(windows), nominal.recipe
         return pulse_parameters(pulses, recipe.preparation, recipe.scores)
 
-    first, second = translated(of_all.ren, 1), translated(of_all.ren, 2)
+    first, second = translated(nominal, 1), translated(nominal, 2)
     changes = [0.5 * (translated(one, 2) - translated(other, 2)) for one, other in ends]
     draws = np.random.default_rng(seed).normal(size=(FIT_DRAWS, len(ends)))
     of_first, aucs = chief(first), []
@@ -356,15 +354,13 @@ def moved_values(peak: PeakSets, ends: Ends, seed: int) -> dict[str, Values]:
     dict
         By name, shape ``(axes, 2, pulses)``; empty without axes or pulses.
     """
-    rows = peak.rows["ren"]
-    rows = rows[np.linspace(0, len(rows) - 1, min(len(rows), MOVED)).astype(int)]
-    if not ends or not len(rows):
+    raw, by_end = peak.some(MOVED), []
+    if not ends or not len(raw):
         return {}
-    windows = peak.translations.windows["raw"][rows]
-    kev, by_end = peak.translations.energy_kev["ren"][rows], []
     for ren in (ren for pair in ends for ren in pair):
-        moved = ren.apply(windows, energy_kev=kev, generator=np.random.default_rng(seed))
-        pulses, recipe = Pulses.of(moved, dt_ns=ren.dt_ns), ren.recipe
+        rng, recipe = np.random.default_rng(seed), ren.recipe
+        moved = ren.apply(raw.waveforms, energy_kev=raw.energy_kev, generator=rng)
+        pulses = raw.with_waveforms(moved)
         by_end.append(all_parameters(pulses, recipe.preparation, recipe.scores))
-    shape = len(ends), 2, len(rows)
+    shape = len(ends), 2, len(raw)
     return {name: np.reshape([values[name] for values in by_end], shape) for name in by_end[0]}

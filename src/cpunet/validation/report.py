@@ -14,17 +14,18 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-from zipfile import BadZipFile
 
+import hist
 import numpy as np
 from pydantic import ValidationError
 
 from cpunet.errors import CpunetError, named
 from cpunet.outputs import FolderKind, folder_written_aside
-from cpunet.plotting import COLOURS, label
+from cpunet.plotting import COLOURS, label, own_axes
 from cpunet.progress import stage
 from cpunet.pulses.parameters import Values
-from cpunet.pulses.shape_parameters import LABELLED
+from cpunet.pulses.reading.other_formats import read_arrays
+from cpunet.pulses.shape_parameters import LABELLED, Histogram, labelled
 from cpunet.settings import flat, read_json
 from cpunet.tables import number, text_table, with_std
 from cpunet.validation.metrics import Metrics, called
@@ -33,8 +34,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
     from pandas import DataFrame
-
-    from cpunet.pulses.shape_parameters import Histogram
 
 METRICS, VALUES, PAGE = "metrics.json", "parameters.npz", "report.html"
 REPORT = FolderKind(
@@ -50,7 +49,6 @@ _NAMES = {
     "ren": "REN",
     "current_amplitude": "I_max",
     "drift_time": "T_drift",
-    "tail_slope": "tail slope",
     "rc_late": "RC + late",
     "ceiling": "data vs data",
 }
@@ -58,37 +56,21 @@ _SHOWN = ("raw", "ren", "truth", "ceiling")  # methods in a notebook's table
 
 
 FIRST = 3  # figures of overlap and mean pulses at the top of the page, and of noise
-# What a figure shows, for readers of its text alone, by section and the end of its name.
-SECTIONS = {
-    "first": {
-        "overlap with data": "overlap with data by quantity and method; band: data with data",
-        "mean pulse": "mean pulse of the data and each method; differences in standard errors",
-    },
-    "slices": {
-        "superpulses": "mean pulses in four ranges of rise time; differences in standard errors"
-    },
-    "noise": {"noise": "noise power before the pulse by frequency, data and REN; their ratio"},
-    "pulses": {
-        "single pulse": "one simulated pulse by each method, and the nearest measured one"
-    },
-    "further": {
-        "further parameters": "distributions of further parameters, data and each method"
-    },
-    "ae": {
-        "A over E survival": "survival of other peaks against that of the double-escape peak"
-    },
-    "ae_energy": {
-        "A over E and energy": "position and width of the single-site A/E peak against energy"
-    },
-    "others": {
-        "losses": "losses of the training by iteration",
-        "cycle of simulation": "simulated pulses, their translations, and those back",
-        "cycle of data": "measured pulses, their translations, and those back",
-    },
-    "distributions": {
-        "": "distribution in the data and by each method, and differences in standard errors"
-    },
-}
+# Section, end of the name of a figure, and what it shows, for readers of its text alone.
+SECTIONS = (
+    ("first", "overlap with data", "overlap with data by method; band: data with data"),
+    ("first", "mean pulse", "mean pulses by method; differences in standard errors"),
+    ("slices", "superpulses", "mean pulses in four ranges of rise time; differences"),
+    ("noise", "noise", "noise power before the pulse by frequency, data and REN; ratio"),
+    ("pulses", "single pulse", "a simulated pulse by each method, and the nearest measured"),
+    ("further", "further parameters", "distributions of further parameters by method"),
+    ("ae", "A over E survival", "survival of other peaks against that of the DEP"),
+    ("ae_energy", "A over E and energy", "position and width of the A/E peak against energy"),
+    ("others", "losses", "losses of the training by iteration"),
+    ("others", "cycle of simulation", "simulated pulses, their translations, and those back"),
+    ("others", "cycle of data", "measured pulses, their translations, and those back"),
+    ("distributions", "", "distributions by method, and differences in standard errors"),
+)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -108,7 +90,7 @@ class Report:
     drawn
         Functions that draw the figures, by name; none for a report that was opened.
     notes
-        Paragraphs for the top of the page.
+        Further paragraphs for the top of the page.
     """
 
     metrics: Metrics
@@ -129,15 +111,9 @@ class Report:
         remedy = "give the folder of a report, or make one with cpunet.validate"
         metrics = read_metrics(Path(folder) / METRICS, remedy)
         values: dict[str, dict[str, dict[str, Values]]] = {}
-        try:
-            with np.load(Path(folder) / VALUES, allow_pickle=False) as stored:
-                for key in stored:
-                    peak, method, name = key.rsplit("/", 2)
-                    values.setdefault(peak, {}).setdefault(method, {})[name] = stored[key]
-        except (OSError, ValueError, BadZipFile) as error:
-            raise CpunetError(
-                f"{Path(folder) / VALUES}: cannot be read ({error})", "validate again"
-            ) from error
+        for key, stored in read_arrays(Path(folder) / VALUES).items():
+            peak, method, name = key.rsplit("/", 2)
+            values.setdefault(peak, {}).setdefault(method, {})[name] = stored
         return cls(metrics, values, Path(folder))
 
     @cached_property
@@ -205,10 +181,6 @@ class Report:
         CpunetError
             If there is no such peak or parameter.
         """
-        import hist
-
-        from cpunet.pulses.shape_parameters import Histogram, labelled
-
         of_peak = named(self.values, peak, "scored peak")
         named(of_peak["data"], parameter, "parameter")
         scores = self.metrics.peaks[peak]
@@ -242,7 +214,6 @@ class Report:
         CpunetError
             If there is no such peak, or no such parameter is scored there.
         """
-        from cpunet.plotting import own_axes
         from cpunet.validation.figures import draw_parameter
 
         peak = next(iter(self.values)) if peak is None else peak
@@ -290,17 +261,12 @@ class Report:
         }
         np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
 
-        placed: dict[str, dict[str, Markup]] = {place: {} for place in SECTIONS}
+        placed: dict[str, dict[str, Markup]] = {place: {} for place, _, _ in SECTIONS}
         with stage("Drawing", len(self.drawn)) as bar:
             for name, draw in self.drawn.items():
                 stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
                 caption = name.replace("_", " ")
-                place, shows = next(
-                    (section, text)
-                    for section, of_section in SECTIONS.items()
-                    for end, text in of_section.items()
-                    if caption.endswith(end)
-                )
+                place, _, shows = next(of for of in SECTIONS if caption.endswith(of[1]))
                 placed[place][name] = figure_html(
                     caption, draw(), folder / f"{stem}.svg", shows
                 )
@@ -316,20 +282,15 @@ class Report:
             few = [n for n in shown if not n.startswith(trained)][:FIRST] or [*shown][:FIRST]
             placed["others"] |= {name: html for name, html in shown.items() if name not in few}
             placed[place] = {name: shown[name] for name in few}
-        good, verdict = metrics.headline() if metrics.scored else (False, "")
         html = rendered(
             "report.html",
             title="CPU-Net validation",
             metrics=metrics,
             placed={place: [*of_place.values()] for place, of_place in placed.items()},
             notes=self.notes,
-            good=good,
-            headline=verdict,
-            methods=[{"name": m, "label": label(m), "colour": COLOURS[m]} for m in methods],
-            rejections=[*flat(metrics.rejections, ": ")],
-            training=[*flat(metrics.training, ": ")],
+            colours={method: COLOURS[method] for method in methods},
             script=Markup(asset("report.js")),
-            **{f.__name__: f for f in (called, label, number, with_std)},
+            **{f.__name__: f for f in (called, flat, label, number, with_std)},
             unit=lambda name: LABELLED[name].unit,
         )
         (folder / PAGE).write_text(html, encoding="utf-8")
@@ -361,13 +322,13 @@ class Report:
     def _table(self, methods: Iterable[str]) -> tuple[list[str], list[list[str]]]:
         """IoU by peak and parameter, of the methods that have any."""
         of_all = {
-            (peak, _NAMES.get(parameter, parameter)): compared.iou
+            (peak, _NAMES.get(parameter, parameter.replace("_", " "))): compared.iou
             for peak, scores in self.metrics.peaks.items()
             for parameter, compared in scores.parameters.items()
         }
         shown = [m for m in methods if any(m in iou for iou in of_all.values())]
         rows = [
-            [*place, *("–" if iou.get(m) is None else f"{iou[m]:.1f}" for m in shown)]
+            [*place, *(number(iou.get(m), ".1f") for m in shown)]
             for place, iou in of_all.items()
         ]
         return ["peak", "parameter", *(_NAMES.get(m, m) for m in shown)], rows

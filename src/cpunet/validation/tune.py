@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-JOURNAL, BEST, TABLE = "journal.log", "best.yaml", "trials.csv"
+JOURNAL, BEST = "journal.log", "best.yaml"
 STARTS = 8  # random trials before the first Gaussian process
 SHARE = 0.3  # share of the pulses of each side that is held out
 MIN_PULSES = 20  # minimum per side for a distribution
@@ -66,8 +66,8 @@ def tune(
     sim, data, peak, device, read
         See `cpunet.train`.
     out
-        Folder of the search, a new one or one to continue: ``best.yaml`` (a recipe),
-        ``trials.csv``, and ``journal.log`` with all that Optuna knows.
+        Folder of the search, a new one or one to continue: ``best.yaml`` (a recipe), and
+        ``journal.log`` with all that Optuna knows.
     space
         Distributions of Optuna by setting, as
         ``{"training.level_ns": FloatDistribution(100, 2000, log=True)}``.
@@ -143,15 +143,12 @@ def tune(
                 log.info(f"trial {trial.number} failed: {error}")
                 study.tell(trial, state=ended[1])
         bar.update(done - bar.n)
-    _write(out, study, recipe)
+    _write_best(out, study, recipe)
     return study
 
 
-def _write(out: Path, study: Study, recipe: Recipe) -> None:
-    """Write all trials, and the recipe of the best."""
-    with written_aside(out / TABLE) as aside:
-        columns = ("number", "state", "value", "duration", "params", "user_attrs")
-        study.trials_dataframe(columns).to_csv(aside, index=False)
+def _write_best(out: Path, study: Study, recipe: Recipe) -> None:
+    """Write the recipe of the best trial."""
     if all(trial.value is None for trial in study.trials):
         reasons = (t.user_attrs[REASON] for t in study.trials if REASON in t.user_attrs)
         first = next(reasons, "interrupted")

@@ -24,7 +24,6 @@ from cpunet.pulses.reading.files import ALL, PulseFile, ReadOptions, Source
 from cpunet.pulses.shape_parameters import median_decay_ns
 from cpunet.recipes.schema import Recipe
 from cpunet.settings import require_seed
-from cpunet.tables import with_std
 from cpunet.training.run import INFO, Run, RunLike, resolve_device, used_run
 from cpunet.translation.translator import REN
 from cpunet.validation.a_over_e import DEP, Range, dep_scales, survivals
@@ -145,35 +144,14 @@ def _validated(
     pair = run.sim.reading(pair[0]), run.data.reading(pair[1])
     read = (run.folder, *pair[0].files, *pair[1].files, truth)
     written = folder_written_aside(out, REPORT, *read, force=force) if out else nullcontext()
-    notes = [
-        f"Peaks other than {run.peak} took no part in the training.",
-        "IoU is the overlap of two distributions in percent. Two samples of the same "
-        "distribution do not reach 100 at finite size: data vs data is what two samples of the "
-        "measured distribution have at these sizes.",
-    ]
-    tails = None if run.fit is None else run.fit.tails
-    if tails is not None and tails.rate_khz:
-        shares = ", ".join(
-            f"{share['measured']:.1f} ({share['law']:.1f}) above {size.partition('_')[0]} keV"
-            for size, share in tails.percent_above.items()
-        )
-        notes.append(
-            "Traces of the training lie on pile-up tails, "
-            f"{with_std(tails.rate_khz, tails.rate_error_khz)} kHz decaying with "
-            f"{tails.decay_us:.1f} µs: percent of the traces, measured with an error (by "
-            f"the law), {shares}. All translations and the truth have tails drawn by this law, "
-            "as likely as they pass the quality cuts."
-        )
-    if truth is None:
-        notes.append("No truth was given, so single pulses are not scored.")
     with written as aside:
         evaluation = evaluate(run, *pair, truth=truth, **how)
         # matplotlib is not needed while the pulses take most memory
-        from cpunet.validation.figures import drawings
+        from cpunet.validation.drawings import drawings
 
         drawn = drawings(evaluation)
         values = {peak.name: peak.values for peak in evaluation.sets if peak.values}
-        report = Report(evaluation.metrics, values, out, drawn, notes)
+        report = Report(evaluation.metrics, values, out, drawn)
         del evaluation  # all pulses
         if aside is not None:
             report.write(aside)
