@@ -31,8 +31,8 @@ from cpunet.electronics.baseline_noise import BaselineNoise, record_samples
 from cpunet.electronics.drawn_pile_up import TailsLaw, energies_at
 from cpunet.electronics.finishing import finish, padding
 from cpunet.errors import CpunetError
+from cpunet.networks import Stored
 from cpunet.networks.generators import ResponseGenerator
-from cpunet.networks.stored import Stored
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.reading.files import PulseFile

@@ -19,7 +19,7 @@ import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
 from cpunet.kernels import kernel
-from cpunet.networks.stored import Stored
+from cpunet.networks import Stored
 
 Floats = npt.NDArray[np.floating[Any]]
 

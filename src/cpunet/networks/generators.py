@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from cpunet.electronics.baseline_noise import KINDS, BaselineNoise, record_samples
 from cpunet.electronics.drawn_pile_up import DrawnTails
+from cpunet.networks import Stored
 from cpunet.networks.response_layer import ElectronicsResponse, Floats, Values
-from cpunet.networks.stored import Stored
 from cpunet.recipes.schema import MatchingConfig, ResponseConfig
 
 Residual = Callable[[Floats], npt.NDArray[np.float32]]

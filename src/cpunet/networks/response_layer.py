@@ -18,8 +18,8 @@ from scipy.interpolate import CubicSpline
 
 from cpunet.electronics.finishing import padding as padding
 from cpunet.electronics.finishing import record_length as record_length
+from cpunet.networks import Stored
 from cpunet.networks.by_height import ByHeight
-from cpunet.networks.stored import Stored
 from cpunet.recipes.schema import ResponseConfig
 
 Values = npt.NDArray[np.float64]

@@ -33,8 +33,7 @@ from safetensors.numpy import load, save
 import cpunet
 from cpunet.electronics.drawn_pile_up import DrawnTails
 from cpunet.errors import CpunetError
-from cpunet.networks import require_torch
-from cpunet.networks.stored import Array, Stored
+from cpunet.networks import Array, Stored, require_torch
 from cpunet.outputs import FolderKind, folder_written_aside
 from cpunet.pulses.loading import InfoPart, SideInfo
 from cpunet.recipes.schema import Recipe
