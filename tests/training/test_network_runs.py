@@ -8,11 +8,11 @@ import pytest
 from cpunet.errors import CpunetError
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training import network_runs
+from cpunet.training.figures import loss_curves
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.translation.export import export_onnx
 from cpunet.translation.translator import IREN, REN
-from cpunet.validation.figures import loss_curves
 from games import SMALL
 from synthetic import (
     load_recipe,

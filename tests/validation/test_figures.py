@@ -9,7 +9,7 @@ from scipy.special import ndtr
 
 from cpunet.pulses.parameters import PARAMETERS, align_half_maximum
 from cpunet.pulses.shape_parameters import SHAPE_PARAMETERS, data_axis
-from cpunet.training.figures import sides_figure
+from cpunet.training.figures import loss_curves, sides_figure
 from cpunet.validation import figures
 from cpunet.validation.comparisons import compare
 from cpunet.validation.drawings import nearest
@@ -48,7 +48,7 @@ def test_all_losses_are_drawn_with_their_moving_average():
     for record in records:
         if record["iteration"] % 30:
             del record["losses"]["discriminator_data"]
-    figure = figures.loss_curves(records)
+    figure = loss_curves(records)
     require_drawn(figure)
     assert [len(axes.lines) for axes in figure.axes] == [len(LOSS_NAMES) / 2] * 4
     average = figure.axes[1].lines[0].get_xydata()
@@ -96,7 +96,7 @@ def test_differences_of_mean_pulses_are_in_standard_errors():
 def test_global_settings_neither_change_nor_matter():
     before = dict(mpl.rcParams)
     with mpl.rc_context({"font.size": 30.0, "axes.grid": False}):
-        figure = figures.loss_curves(log(5))
+        figure = loss_curves(log(5))
         assert mpl.rcParams["font.size"] == 30.0
     assert dict(mpl.rcParams) == before
     assert figure.axes[0].xaxis.label.get_size() == 10.0

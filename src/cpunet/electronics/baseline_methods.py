@@ -197,14 +197,14 @@ def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
     CpunetError
         If the data are slower than the maximum tau.
     """
-    wanted = most_frequent(current_amplitude(steps, dt_ns))
+    wanted = shorth(current_amplitude(steps, dt_ns))
     before, current = padding(dt_ns)[0], currents(sim, dt_ns)
     window, longest = slice(before, before + sim.shape[1]), LONGEST_NS / dt_ns
 
     def excess(tau: float) -> float:
         slower = scipy.signal.lfilter([0.0, 1 / tau], [1.0, 1 / tau - 1.0], current)
         response = np.cumsum(slower, axis=1)[:, window]
-        return most_frequent(current_amplitude(response.astype(np.float32), dt_ns)) - wanted
+        return shorth(current_amplitude(response.astype(np.float32), dt_ns)) - wanted
 
     if excess(1.0) <= 0:
         tau_ns = dt_ns  # the data rise faster than the simulation: any integration is worse
@@ -218,14 +218,14 @@ def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
     return np.asarray(rate * delay / (1 + (rate - 1) * delay)), {"tau_ns": tau_ns}
 
 
-def most_frequent(values: Values) -> float:
-    """Median of the shortest interval that contains half of the values.
+def shorth(values: Values) -> float:
+    """Median of the shortest half of the values.
 
     For current amplitudes this is the single-site peak, which is the narrowest.
 
     Examples
     --------
-    >>> most_frequent(np.array([0.0, 1.0, 5.0, 5.1, 5.2, 9.0]))
+    >>> shorth(np.array([0.0, 1.0, 5.0, 5.1, 5.2, 9.0]))
     5.1
     """
     ordered = np.sort(values[np.isfinite(values)])

@@ -307,8 +307,8 @@ class Run(InfoPart):
             If a run of networks contains no losses.
         """
         from cpunet.training.chain_description import describe_chain
+        from cpunet.training.figures import loss_curves
         from cpunet.training.response import Response
-        from cpunet.validation.figures import loss_curves
 
         if self.recipe.generator.name != "response":
             return loss_curves(self.records)

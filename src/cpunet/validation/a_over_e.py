@@ -303,7 +303,7 @@ def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, tuple[f
         Seed of the bootstraps.
     """
     # half of SciPy, which those who only read scores need not wait for
-    from cpunet.electronics.baseline_methods import most_frequent
+    from cpunet.electronics.baseline_methods import shorth
 
     finite = {method: finite_values(values) for method, values in dep_ae.items()}
     if not all(values.size >= MIN_EVENTS for values in finite.values()):
@@ -311,8 +311,8 @@ def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, tuple[f
     scales = {}
     for method, values in finite.items():
         rng = np.random.default_rng(seed)
-        drawn = [most_frequent(rng.choice(values, values.size)) for _ in range(SCALES)]
-        scales[method] = most_frequent(values), float(np.std(drawn, ddof=1))
+        drawn = [shorth(rng.choice(values, values.size)) for _ in range(SCALES)]
+        scales[method] = shorth(values), float(np.std(drawn, ddof=1))
     return scales
 
 

@@ -17,6 +17,7 @@ from matplotlib.figure import Figure
 from cpunet.pulses.container import FloatArray
 from cpunet.pulses.parameters import Values
 from cpunet.pulses.shape_parameters import data_axis
+from cpunet.training.figures import loss_curves
 from cpunet.translation.translator import IREN
 from cpunet.validation import figures
 from cpunet.validation.a_over_e import DEP
@@ -64,7 +65,7 @@ def drawings(evaluated: Evaluation) -> dict[str, Drawing]:
             name = f"{fullest.name} cycle of {names[0].lower()}"
             drawn[name] = partial(figures.cycle_figure, stages, ren.dt_ns)
     if run.records:
-        drawn["losses"] = partial(figures.loss_curves, run.records)
+        drawn["losses"] = partial(loss_curves, run.records)
     return drawn
 
 

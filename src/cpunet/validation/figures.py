@@ -6,8 +6,7 @@ made in worker processes and notebooks alike.  The caller saves them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Mapping
 
 import hist
 import numpy as np
@@ -15,7 +14,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from cpunet.errors import CpunetError
 from cpunet.plotting import (
     COLOURS,
     DATA_FILL,
@@ -41,61 +39,11 @@ from cpunet.validation.metrics import QUANTITIES, Metrics
 from cpunet.validation.noise import Spectrum
 from cpunet.validation.peaks import BEFORE_NS, MeanPulse
 
-AVERAGES = 50  # a moving average is over this fraction of the records
 OUTSIDE = 0.01  # share of events outside the range from which it is stated
 SIGMAS, PERCENT = 8.0, 3.0  # range of differences in standard errors, and of full charge
 COLUMNS = 4  # panels of further parameters in a row
 ROC_POINTS = 201  # points per curve
 ROC_RANGE = (50, 100)  # percent of the DEP that useful cuts keep
-
-
-@styled
-def loss_curves(records: Sequence[Mapping[str, Any]]) -> Figure:
-    """Losses during the training, and how often critics were right, each kind in a panel.
-
-    Records are faint, moving averages on top of them; dashed lines are of pulses that critics
-    have not seen.
-
-    Parameters
-    ----------
-    records
-        Records of the training log: ``{"iteration": i, "losses": {name: value, …}}``, in
-        order.
-
-    Raises
-    ------
-    CpunetError
-        If there are no records.
-    """
-    if not records:
-        raise CpunetError("the training log is empty: there are no losses to draw; train first")
-    drawn = [
-        (part, name)
-        for part in ("losses", "accuracy")
-        for name in dict.fromkeys(name for record in records for name in record.get(part, ()))
-    ]
-    kinds = [name.partition("_")[0] if part == "losses" else part for part, name in drawn]
-    shown = list(dict.fromkeys(kinds))
-    figure, (grid,) = panels((1.4 + 3.2 * len(shown), 3.6), 1, len(shown))
-    for (part, name), kind in zip(drawn, kinds, strict=True):
-        axes = grid[shown.index(kind)]
-        # critics are not updated, and cycles not visited, in every iteration
-        present = [record for record in records if name in record.get(part, ())]
-        at = [record["iteration"] for record in present]
-        series = [record[part][name] for record in present]
-        width = max(1, len(series) // AVERAGES)
-        average = np.convolve(series, np.full(width, 1 / width), mode="valid")
-        style = "--" if name.endswith("unseen") else "-"
-        (line,) = axes.plot(at[width - 1 :], average, style, label=name.replace("_", " "))
-        axes.plot(at, series, color=line.get_color(), alpha=0.25, linewidth=0.7)
-        axes.set(xlabel="Iteration (lines: moving averages)")
-        axes.set_yscale("log" if part == "losses" else "linear")
-        axes.legend()
-    grid[0].set_ylabel("Loss")
-    if shown[-1] == "accuracy":
-        grid[-1].set(ylabel="Part of pairs ordered rightly", ylim=(0.4, 1.02))
-        grid[-1].axhline(0.5, color="black", linewidth=0.8)
-    return figure
 
 
 @styled
