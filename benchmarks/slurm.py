@@ -58,12 +58,12 @@ def prepare(folder: Path) -> Path:
 
 
 def start(folder: Path, log: str, status_command: str) -> subprocess.Popen[bytes]:
-    """Snakemake with the workflow's profile; a training fits into memory at its second try."""
+    """Snakemake with the workflow's profile; a training fits into memory at a later try."""
     words = [sys.executable, "-m", "snakemake", "-s", str(ROOT / "workflow" / "Snakefile")]
     words += ["--profile", str(ROOT / "workflow" / "profiles" / "slurm")]
     words += ["--configfile", "config.yaml", "--slurm-init-seconds-before-status-checks", "5"]
     words += ["--slurm-status-command", status_command, "--latency-wait", "5"]
-    words += ["--set-resources", "train:mem_mb=150*attempt", "train_seed:mem_mb=150*attempt"]
+    words += ["--set-resources", "train:mem_mb=250*attempt", "train_seed:mem_mb=250*attempt"]
     path = f"{BIN}{os.pathsep}{os.environ['PATH']}"
     with (folder / log).open("w") as printed:
         return subprocess.Popen(
