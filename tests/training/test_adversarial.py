@@ -73,7 +73,7 @@ def test_solved_parts_are_those_of_the_readout():
     np.testing.assert_allclose(SolvedInverse(inverse)(data), inverse(data.numpy()), atol=1e-5)
 
 
-def test_a_learned_response_begins_as_two_poles_and_the_decay_of_the_data():
+def test_a_learned_response_is_causal_and_begins_as_two_poles_and_the_decay_of_the_data():
     response = LearnedResponse(PREPARATION, decay=1 / 1800)
     step = torch.zeros(1, 800)
     step[:, 400:] = 1.0
@@ -83,6 +83,10 @@ def test_a_learned_response_begins_as_two_poles_and_the_decay_of_the_data():
     torch.testing.assert_close(record[:40] / record[60] * wanted[39], wanted, atol=0.03, rtol=0)
     fallen = float((record[399] / record[199]).detach())
     assert fallen == pytest.approx(math.exp(-200 / 1800), rel=2e-3)
+    torch.manual_seed(0)
+    response.sizes.data.normal_()  # whatever it learns, nothing precedes a step
+    early = response(step)[0, : padding(16.0)[0] + 400]
+    torch.testing.assert_close(early, torch.zeros_like(early), atol=2e-6, rtol=0)
 
 
 @pytest.mark.parametrize("moved", ["gain", "shift"])

@@ -14,8 +14,8 @@ from cpunet.networks.generators import LinearInverse
 from cpunet.networks.response_layer import ElectronicsResponse, padded_length
 from cpunet.recipes.schema import PreparationConfig
 
-# Of a learned step response: lags, up to which every sample is free, and the last knot.
-FIRST_NS, DENSE_NS, LAST_NS, KNOTS = -256.0, 768.0, 7040.0, 20
+# Of a learned step response: up to which time every sample is free, and the last knot.
+DENSE_NS, LAST_NS, KNOTS = 768.0, 7040.0, 20
 RISE_NS, MODES = 48.0, 28  # of the two poles it begins with; its free smooth modes
 # Size of deviations (edge, rise, tail), their reach, and how smooth they are in asinh(t / T)
 SIZES, REACH_NS = (0.12, 0.024, 0.006), (192.0, 1920.0)
@@ -97,6 +97,9 @@ class SolvedInverse(nn.Module):
 class LearnedResponse(Linear):
     """A step response that moves in smooth modes, most where it rises.
 
+    It is 0 before the step.  Critics see aligned pulses: a response that is free before the
+    step, too, can move as a whole, and does so without end, bending its foot.
+
     Parameters
     ----------
     config
@@ -112,10 +115,9 @@ class LearnedResponse(Linear):
     def __init__(self, config: PreparationConfig, decay: float) -> None:
         super().__init__(config)
         dt = config.sampled_ns
-        first, dense, last = (round(ns / dt) for ns in (FIRST_NS, DENSE_NS, LAST_NS))
+        dense, last = (round(ns / dt) for ns in (DENSE_NS, LAST_NS))
         later = np.geomspace(dense, last, KNOTS).round().astype(int)
-        knots = np.unique(np.r_[first:dense, later])
-        self.first, lags = first, np.arange(first, self.length - self.before)
+        knots, lags = np.unique(np.r_[:dense, later]), np.arange(self.length - self.before)
         ns = knots * dt
         u, sizes = np.arcsinh(ns / CURVED_NS), np.full(len(ns), SIZES[2])
         for size, reach in zip(SIZES, REACH_NS, strict=False):
@@ -123,8 +125,8 @@ class LearnedResponse(Linear):
         like = np.exp(-0.5 * ((u[:, None] - u) / SMOOTH) ** 2)
         prior = sizes[:, None] * sizes * like + WHITE**2 * np.eye(len(u))
         values, vectors = np.linalg.eigh(prior)
-        rise = np.maximum(ns, 0) / RISE_NS
-        begin = (1 - (1 + rise) * np.exp(-rise)) * np.exp(-decay * np.maximum(knots, 0))
+        rise = ns / RISE_NS
+        begin = (1 - (1 + rise) * np.exp(-rise)) * np.exp(-decay * knots)
         modes = vectors[:, -MODES:] * np.sqrt(values[-MODES:])
         between = np.stack([np.interp(lags, knots, unit) for unit in np.eye(len(knots))], 1)
         for name, array in (("begin", begin), ("modes", modes), ("between", between)):
@@ -134,7 +136,7 @@ class LearnedResponse(Linear):
         self.spacing = float(knots[-1] - knots[-4])
 
     def step(self) -> Tensor:
-        """Response to a step at sample 0, from the first lag on."""
+        """Response to a step at sample 0, from then on."""
         knots = self.begin + self.modes @ self.sizes
         rate = torch.log((knots[-1] / knots[-4]).clamp(0.5, 1.2)) / self.spacing
         late = torch.arange(1.0, 1 + self.late, device=rate.device)  # goes on as it ends
@@ -142,13 +144,7 @@ class LearnedResponse(Linear):
         return torch.cat([free, knots[-1] * torch.exp(rate * late)])
 
     def forward(self, charge: Tensor) -> Tensor:
-        return self.records(charge, self.spectrum_of(self.step()))
-
-    def spectrum_of(self, lags: Tensor) -> Tensor:
-        """Spectrum of values at lags from the first on."""
-        whole = pad(lags, (0, self.padded - len(lags))).roll(self.first)
-        spectrum: Tensor = torch.fft.rfft(whole)
-        return spectrum
+        return self.records(charge, torch.fft.rfft(self.step(), self.padded))
 
 
 class LearnedInverse(nn.Module):
@@ -162,7 +158,7 @@ class LearnedInverse(nn.Module):
     def forward(self, windows: Tensor) -> Tensor:
         r, noise = self.of[0], self.log_noise.exp()
         step = r.step().detach()
-        impulse = r.spectrum_of(step.diff(prepend=step.new_zeros(1)))
+        impulse = torch.fft.rfft(step.diff(prepend=step.new_zeros(1)), r.padded)
         undone = impulse.conj() * (1 + noise) / (impulse.abs().square() + noise)
         charge: Tensor = torch.fft.irfft(r.current(windows) * undone, r.padded).cumsum(dim=1)
         charge = charge[:, r.before : r.before + r.config.length]
