@@ -180,6 +180,7 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
         (dict.fromkeys(WAVEFORMS), "no pulse-shape library"),
         (dict.fromkeys(WAVEFORMS, Array(-charge())), "84 of 84 templates end below half"),
         ({"r": Array(R[::-1].copy(), attrs={"units": "mm"})}, "r does not ascend"),
+        ({"z": Array(Z, attrs={"units": "m"})}, "z reaches 7000 mm"),
         ({"r": Array(R, attrs={"units": "inch"})}, "r is in 'inch'"),
         (
             {"r": Array(np.arange(4.0), attrs={"units": "mm"})},

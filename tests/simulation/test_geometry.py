@@ -164,6 +164,7 @@ def test_files_and_single_keys(tmp_path: Path) -> None:
         ("temperature_K=.nan", "finite"),
         ("impurity_factor=0", "greater than 0"),
         ("diffusion_constant=cold", "diffusion_constant"),
+        ("cloud_fwhm_mm=true", "cloud_fwhm_mm: Input should be a number, not true or false"),
         ("temperature_K=100", "shifted: temperature_K: Input should be less than or equal"),
         ("hole_trapping_per_us=-1", "hole_trapping_per_us"),
     ],

@@ -449,6 +449,7 @@ def test_piled_up_pulses_are_within_windows(busy, tmp_path):
         ({"pile_up_khz": 1e6}, "give a lower rate"),
         ({"pile_up_khz": 1.0, "noise": False}, "or translate with noise"),
         ({"pile_up_khz": 1.0, "inverse": True}, "leave out `pile_up_khz`"),
+        ({"out_table": ""}, "`out_table` is empty"),
         ({"inverse": True, "adc": True}, "leave out `adc`"),
         ({"adc": True, "scale": Adc(bits=40)}, "`bits` is 40; expected 1 to 24"),
         ({"adc": True, "scale": Adc(adc_per_kev=0)}, "expected a number above 0"),

@@ -111,6 +111,9 @@ def test_responses_are_those_of_the_pulses_in_use(tmp_path, dtype):
     found = true_responses(path, prepared(used, 20))
     assert found.dtype == np.float32
     np.testing.assert_array_equal(found, response[used])
+    np.savez(path, response=np.full((20, 2), np.inf))
+    with pytest.raises(CpunetError, match=r"truth.npz: no response is finite"):
+        true_responses(path, prepared(np.arange(20), 20))
     path.write_bytes(path.read_bytes()[:200])
     with pytest.raises(CpunetError, match="cannot be read as NumPy file"):
         true_responses(path, prepared(np.arange(20), 20))

@@ -250,6 +250,8 @@ def freedom(
     --------
     >>> freedom(prior=["temperature=90±0.5"])[2]
     {'temperature_K': (90.0, 0.5)}
+    >>> freedom(prior=["tilt=−0.03±0.01"])[2]  # a minus sign as printed
+    {'impurity_tilt_1e10_per_cm4': (-0.03, 0.01)}
     """
     texts = [free] if isinstance(free, str) else free
     parts = [part for text in texts for part in text.split(",") if part.strip()]
@@ -261,7 +263,8 @@ def freedom(
         prior = [f"{name}={value}±{error}" for name, (value, error) in prior.items()]
     for given in prior:
         try:
-            word, *numbers = re.split("=|±|\\+/?-", given)
+            # tables print a true minus sign
+            word, *numbers = re.split("=|±|\\+/?-", given.replace("−", "-"))
             name, (value, error) = word.strip(), map(float, numbers)
         except ValueError:
             remedy = "expected NAME=VALUE±ERROR, as temperature=90±0.5"

@@ -328,7 +328,10 @@ def adc_scale(run: Run, translator: Translator, adc: Adc) -> tuple[float, float]
         time = np.arange(config.length) - config.samples_before
         ramp = np.clip(time * translator.dt_ns / RISE_NS + 1, 0, 1).astype(np.float32)
         pulse = translator.apply(ramp[np.newaxis], energy_kev=np.ones(1), noise=False)
-        per_kev = adc.adc_per_kev / float(pulse.max())
+        height = float(pulse.max())
+        if not (np.isfinite(height) and height > 0):
+            raise CpunetError("the run cannot translate a fast pulse; train again")
+        per_kev = adc.adc_per_kev / height
     if per_kev is None:
         raise CpunetError(
             f"{run.name}: does not say how many ADC counts a keV is; give `adc_per_kev`"

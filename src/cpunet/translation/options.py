@@ -74,6 +74,8 @@ class TranslateOptions:
             if not (value is None or low <= value <= high):
                 given = self.tails if name == "tails" else value
                 raise CpunetError(f"`{name}` is {given}; expected {expected}")
+        if self.table is not None and not self.table.strip("/ "):
+            raise CpunetError("`out_table` is empty; leave it out, or give a name as geds/ren")
         others = {"tails": self.tails != NONE, "pile_up_khz": self.pile_up_khz > 0}
         for name, asked in {**others, "adc": self.adc is not None}.items():
             if asked and self.inverse:

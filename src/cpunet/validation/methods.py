@@ -55,7 +55,7 @@ def true_responses(path: Path, sim: InputSet) -> FloatArray:
     Raises
     ------
     CpunetError
-        If the file is not readable or belongs to other pulses.
+        If the file is not readable or belongs to other pulses, or no trace is finite.
     """
     arrays = read_arrays(path)
     if "response" not in arrays:
@@ -67,7 +67,10 @@ def true_responses(path: Path, sim: InputSet) -> FloatArray:
             f"{path}: response has shape {values.shape}, but {sim.path} holds "
             f"{sim.prepared.n_read} pulses; give the truth of that file"
         )
-    return np.asarray(values[sim.prepared.index], np.float32)
+    used = np.asarray(values[sim.prepared.index], np.float32)
+    if len(used) and not any(np.isfinite(trace).all() for trace in used):
+        raise CpunetError(f"{path}: no response is finite; give noise-free traces")
+    return used
 
 
 def pair_squares(
