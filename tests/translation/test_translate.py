@@ -368,6 +368,13 @@ def test_counts_are_clipped_where_the_digitisers_end(tmp_path, counts, bits, end
     np.testing.assert_allclose((traces.max(axis=1)[:2] - 100.0) / kev[:2], 4.0, rtol=0.01)
 
 
+@pytest.mark.parametrize("height", [0.0, np.nan])
+def test_a_run_that_makes_no_pulse_has_no_gain(run, monkeypatch, height):
+    monkeypatch.setattr(REN, "apply", lambda _, pulses, **how: np.full_like(pulses, height))
+    with pytest.raises(CpunetError, match="cannot translate a fast pulse; train again"):
+        translate(run, simulated(), adc=True, scale=Adc(adc_per_kev=4.0), noise=False)
+
+
 def truth(done, *names):
     """What was drawn for each pulse."""
     return [done.in_memory.truth[name][0] for name in names]
