@@ -37,7 +37,7 @@ ABOUT = ("recipe", "pulses", "width", "seed")
 
 
 def one_seed(
-    sim: Path, stand: Path, recipe: str, overrides: list[str], seed: int, draws: int
+    sim: Path, stand: Path, recipe: str, overrides: list[str], peak: str, seed: int, draws: int
 ) -> dict[str, Any]:
     """Scores, also over their ceilings, AUC and edge RMSE of one training, and its cost."""
     files = PulseFile(sim / "sim.lh5"), PulseFile(stand / "data.lh5")
@@ -45,7 +45,7 @@ def one_seed(
     with tempfile.TemporaryDirectory() as folder:
         before = time.process_time()
         settings = load_recipe(recipe, overrides)
-        run = train(*files, Path(folder) / "run", recipe=settings, seed=seed)
+        run = train(*files, Path(folder) / "run", recipe=settings, peak=peak, seed=seed)
         assert isinstance(run, Run)
         cpu = time.process_time() - before
         known = truth if truth.exists() and sim == stand else None
@@ -100,6 +100,7 @@ def main() -> None:
     parser.add_argument("--sim", type=Path)
     parser.add_argument("--recipe", default="fast")
     parser.add_argument("--set", action="append", default=[], dest="overrides")
+    parser.add_argument("--peak", default="FEP", help="pulses of the training")
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--draws", type=int, default=1)
     given = parser.parse_args()
@@ -109,7 +110,8 @@ def main() -> None:
         if file.exists():
             continue
         sim = given.sim or given.stand
-        values = one_seed(sim, given.stand, given.recipe, given.overrides, seed, given.draws)
+        how = given.recipe, given.overrides, given.peak
+        values = one_seed(sim, given.stand, *how, seed, given.draws)
         with written_aside(file) as aside:
             aside.write_text(json.dumps(values, indent=1) + "\n")
         print(f"seed {seed}: {values['seconds']:.0f} s", flush=True)
