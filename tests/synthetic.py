@@ -7,8 +7,11 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
+import re
 import resource
 import signal
+import subprocess
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -350,6 +353,19 @@ def write_table(
     return Path(path)
 
 
+def write_csv(path: Path, columns: list[str], rows: list[str], title: str = "hits") -> Path:
+    """Write hits as Geant4's analysis writes them as text."""
+    head = f"#class tools::wcsv::ntuple\n#title {title}\n#separator 44\n"
+    head += "".join(f"#column double {name}\n" for name in columns)
+    path.write_text(head + "\n".join(rows))
+    return path
+
+
+def rows_of(table: str) -> list[str]:
+    """Rows of a table in a text; a row goes on in lines that begin with spaces."""
+    return re.sub(r"\n +", " ", table).strip().splitlines()
+
+
 def status_of(*words: object) -> Any:
     """Run the command line in this process; its status."""
     arguments, sys.argv = sys.argv, ["cpunet", *map(str, words)]
@@ -359,6 +375,31 @@ def status_of(*words: object) -> Any:
     finally:
         sys.argv = arguments
     return stop.value.code
+
+
+PROGRAM = """
+{before}
+import sys
+from cpunet.cli import main
+for words in sys.argv[1:]:
+    sys.argv[1:] = words.split()
+    try:
+        main()
+    except SystemExit as end:
+        if end.code:
+            raise
+{after}
+"""
+
+
+def in_a_process(
+    *commands: str, before: str = "", after: str = "", **environment: str
+) -> subprocess.CompletedProcess[str]:
+    """Run commands in a process of their own, one after the other, between other lines."""
+    program = PROGRAM.format(before=before, after=after)
+    words = [sys.executable, "-W", "error", "-c", program, *commands]
+    environment = os.environ | environment
+    return subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
 
 
 @contextmanager

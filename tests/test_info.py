@@ -17,7 +17,7 @@ from cpunet.pulses.container import Pulses
 from cpunet.pulses.provenance import left_out, trace_properties
 from cpunet.simulation.hit_files import describe_hits
 from cpunet.training import chain_description
-from synthetic import load_recipe, status_of, write_pulses, write_run
+from synthetic import load_recipe, status_of, write_csv, write_pulses, write_run
 
 RECIPE = load_recipe("fast")
 DT = FileOptions(dt_ns=16)
@@ -124,11 +124,7 @@ def test_files_of_hits_are_described(tmp_path):
     assert told["hits"] == "3 of 2 events"
     assert told["energy"] == "50 … 2614.5 keV an event"
     assert told["lines"] == "1 FEP"
-    csv = tmp_path / "hits.csv"
-    names = "".join(f"#column double {name}\n" for name in ("event", "Edep", "x", "y", "z"))
-    csv.write_text(
-        f"#class tools::wcsv::ntuple\n#title hits\n#separator 44\n{names}1,200,3,4,5\n"
-    )
+    csv = write_csv(tmp_path / "hits.csv", ["event", "Edep", "x", "y", "z"], ["1,200,3,4,5"])
     assert "z 10 … 30, r 0 … 5 mm" in str(info(path))
     assert "names no unit" in str(info(csv))
     assert "x 30 … 30" in str(info(csv, units="cm,keV"))

@@ -15,6 +15,8 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.channels import channel_names, channels_of, each_channel, paired
 from cpunet.pulses.reading.files import PulseFile
 
+log = logging.getLogger("cpunet.pulses")
+
 
 @pytest.fixture
 def raw(stand, tmp_path: Path) -> Path:
@@ -98,9 +100,6 @@ def test_check_looks_at_each_channel(command, stand, raw, tmp_path):
     assert pictures[:2] == ["check-ch1.png", "check-ch2.png"]
 
 
-log = logging.getLogger("cpunet.pulses")
-
-
 def made(path: Path, *tables: str) -> Path:
     with h5py.File(path, "w") as file:
         for table in tables:
@@ -157,8 +156,7 @@ def test_one_that_fails_is_counted_and_the_others_go_on(tmp_path, caplog, monkey
 
     monkeypatch.setenv("OMP_NUM_THREADS", cores)
     outcome = each_channel(paired(data, data), tmp_path / "out", work)
-    assert list(outcome.done) == ["ch1", "ch3"]
-    assert outcome.done == {"ch1": "ch1", "ch3": "ch3"}
+    assert [*outcome.done.items()] == [("ch1", "ch1"), ("ch3", "ch3")]
     assert outcome.failed == {"ch2": "too few pulses"}
     assert "ch2: failed: too few pulses" in caplog.messages
     for name in ("ch1", "ch3"):  # each has its own messages

@@ -13,6 +13,7 @@ import pytest
 
 from cpunet.pulses.loading import SideInfo
 from cpunet.pulses.reading.files import PulseFile
+from synthetic import after_pole
 
 N = 240
 FEP = 2614.511
@@ -27,20 +28,15 @@ class Sides:
         self.sim, self.kev = stand.charge(N, rng), np.full(N, FEP) + rng.normal(0, 0.5, N)
         self.records = stand.respond(stand.charge(N, rng))
 
-    def write_sim(self, name: str = "sim", waveforms: Any = None, kev: Any = None) -> Path:
+    def write_sim(self, waveforms: Any = None) -> Path:
         waveforms = np.float32(self.sim if waveforms is None else waveforms)
-        kev = self.kev if kev is None else kev
-        return self._stand.write(
-            self.folder / f"{name}.lh5", "geds/sim", waveforms, kev, units=""
-        )
+        file = self.folder / "sim.lh5"
+        return self._stand.write(file, "geds/sim", waveforms, self.kev, units="")
 
-    def write_data(
-        self, name: str = "data", traces: Any = None, kev: Any = None, dt_ns: float = 16.0
-    ) -> Path:
+    def write_data(self, name: str = "data", traces: Any = None, kev: Any = None) -> Path:
         traces = self.traces if traces is None else traces
         kev = self.kev if kev is None else kev
-        file = self.folder / f"{name}.lh5"
-        return self._stand.write(file, "geds/raw", traces, kev, dt_ns=dt_ns)
+        return self._stand.write(self.folder / f"{name}.lh5", "geds/raw", traces, kev)
 
     @property
     def traces(self) -> Any:
@@ -79,10 +75,8 @@ def test_sides_that_fit(sides, check):
 
 def test_a_window_shorter_than_the_drift_is_named_with_the_setting_that_mends_it(sides, check):
     files = sides.write_sim(), sides.write_data()
-    tight = ("preparation.before_ns=700", "preparation.baseline_ns=500")
-    words = [
-        word for setting in (*tight, "training.before_ns=600") for word in ("--set", setting)
-    ]
+    words = ["--set", "preparation.before_ns=700", "--set", "preparation.baseline_ns=500"]
+    words += ["--set", "training.before_ns=600"]
     line = first(check(*files, *words))
     assert "the window is shorter than the drift" in line
     remedy = re.search(r"preparation\.before_ns=\d+", line)
@@ -94,9 +88,8 @@ def test_a_window_shorter_than_the_drift_is_named_with_the_setting_that_mends_it
 
 def test_a_calibration_that_is_off(sides, check):
     sim, data = sides.write_sim(), sides.write_data(kev=sides.kev * 0.99)
-    told = next(
-        line for line in check(sim, data, "--peak", "2500-").out.splitlines() if "-26.1" in line
-    )
+    lines = check(sim, data, "--peak", "2500-").out.splitlines()
+    told = next(line for line in lines if "-26.1" in line)
     assert "line FEP of the measured pulses at 2588.4 keV" in told
     assert "energies times 1.01010" in told
     right = sides.write_data("right", kev=sides.kev * 0.99 * 1.0101)
@@ -117,14 +110,9 @@ def test_another_detector(sides, check):
 
 def test_a_slow_readout_is_no_other_detector(sides, check, stand):
     """It hides differences of short rises, which simulated pulses behind it do not have."""
-    kernel = np.exp(-np.arange(100) / 20)
-    kernel /= kernel.sum()
-    slow = np.apply_along_axis(
-        lambda row: np.convolve(row, kernel)[: len(row)], 1, sides.records
-    )
-    done = check(
-        sides.write_sim(), sides.write_data(traces=stand.digitised(slow, sides.kev, seed=3))
-    )
+    slow = after_pole(sides.records, tau=20, kept=100)
+    traces = stand.digitised(slow, sides.kev, seed=3)
+    done = check(sides.write_sim(), sides.write_data(traces=traces))
     assert done.code == 0
     assert "another detector" not in done.out
 

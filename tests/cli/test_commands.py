@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -14,6 +12,7 @@ from cyclopts import App
 from compiled import OWN
 from cpunet.cli import COMMANDS, application
 from cpunet.networks.positional_unet import PositionalUNet
+from synthetic import in_a_process, rows_of
 
 app = application()
 
@@ -40,34 +39,25 @@ def test_commands_that_compile_what_tests_share_exist(line):
     app.parse_args(line.split(), exit_on_error=False, print_error=False)
 
 
-def told_without(words: list[str], heavy: str) -> str:
+def told_without(command: str, heavy: str) -> str:
     """What a command prints in a process of its own, which has loaded none of these."""
-    program = (
-        f"import sys, cpunet.cli as program; sys.argv[1:] = {words}\n"
-        "try:\n    program.main()\nexcept SystemExit as end:\n    assert not end.code\n"
-        f"sys.exit(', '.join(sorted({{*{heavy.split()}}} & sys.modules.keys())) or 0)"
-    )
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    loaded = f"sys.exit(', '.join(sorted({{*{heavy.split()}}} & sys.modules.keys())) or 0)"
+    done = in_a_process(command, after=loaded)
     assert (done.returncode, done.stderr) == (0, "")
     return done.stdout
 
 
-@pytest.mark.parametrize("words", [["--help"], ["train", "--help"]])
-def test_the_help_does_not_load_torch(words):
-    lists = " numpy" if len(words) == 1 else ""
-    told_without(words, f"torch lh5 lgdo dspeed matplotlib scipy numba{lists}")
+@pytest.mark.parametrize(("command", "more"), [("--help", " numpy"), ("train --help", "")])
+def test_the_help_does_not_load_torch(command, more):
+    told_without(command, f"torch lh5 lgdo dspeed matplotlib scipy numba{more}")
 
 
 def test_plain_files_load_neither_torch_nor_compiled_loops(stand):
     """A look at a file waits for nothing that networks, compressed traces or figures need."""
     heavy = "torch numba scipy lh5 lgdo dspeed pandas matplotlib hist"
-    told = told_without(["info", str(stand.data)], heavy)
+    told = told_without(f"info {stand.data}", heavy)
     n, length = stand.data_waveforms.shape
     assert f"{n} of {length} samples, every 16 ns" in told
-
-
-PARAMETERS = {"current_amplitude", "drift_time", "tail_slope"}
 
 
 def listing(folder: Path) -> list[str]:
@@ -113,7 +103,7 @@ def test_raw_simulations_score_what_is_known_of_them(
     metrics = json.loads((out / "metrics.json").read_text())
     assert set(metrics["peaks"]) == {"SEP", "DEP", "FEP"}
     for scores in metrics["peaks"].values():
-        assert set(scores["parameters"]) == PARAMETERS
+        assert set(scores["parameters"]) == {"current_amplitude", "drift_time", "tail_slope"}
         tail = scores["parameters"]["tail_slope"]
         assert tail["iou"]["raw"] == 0
         assert tail["wasserstein"]["raw"] == pytest.approx(1e3 / 55, rel=0.03)
@@ -149,7 +139,7 @@ library translate | RUN D/hits.lh5 | RUN/l.lh5
 import | --ren D/fep_REN.pt | D
 """
 SIDES = "--sim D/sim.lh5 --data D/data.lh5"
-CASES = [row.replace("SIDES", SIDES).split(" | ") for row in REPLACING.strip().splitlines()]
+CASES = [row.split(" | ") for row in rows_of(REPLACING.replace("SIDES", SIDES))]
 
 
 def writing_commands(below: App = app, name: str = "") -> set[str]:

@@ -1,4 +1,4 @@
-"""Environments of containers, batch systems and scripts."""
+"""Environments of containers, batch systems and scripts; readouts without torch."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numba
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 
 import cpunet
 from cpunet.kernels import kernel
+from synthetic import in_a_process, write_chain
 
 
 def python(*words: object, status: int = 0, **environment: str) -> str:
@@ -25,10 +27,9 @@ def python(*words: object, status: int = 0, **environment: str) -> str:
     return said
 
 
-@pytest.mark.parametrize("words", [["--help"], ["info", "--help"], ["info", "FILE"]])
-def test_without_docstrings(stand, words):
-    given = [str(stand.sim) if word == "FILE" else word for word in words]
-    assert "Traceback" not in python("-m", "cpunet", *given, PYTHONOPTIMIZE="2")
+def test_without_docstrings(stand):
+    done = in_a_process("--help", "info --help", f"info {stand.sim}", PYTHONOPTIMIZE="2")
+    assert (done.returncode, done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("encoding", ["ascii", "utf-8"])
@@ -93,3 +94,47 @@ def test_a_signal_that_is_ignored_stays_so(command, stand, monkeypatch, name):
         assert signal.getsignal(number) == before
     finally:
         signal.signal(number, signal.SIG_DFL)
+
+
+NO_TORCH = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "torch":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+"""
+
+
+def test_a_readout_is_used_without_torch(tmp_path: Path, stand):
+    run, outs = write_chain(tmp_path / "run", noise_kev=2), [tmp_path / n for n in "abc"]
+    done = in_a_process(
+        f"translate {run} {stand.sim} --seed 1 --out {outs[0]}",
+        f"response {run} --out {outs[1]}",
+        f"export onnx {run} {outs[2]}",
+        before=NO_TORCH,
+    )
+    assert done.returncode == 0, done.stderr
+    assert all(out.exists() for out in outs)
+
+
+def test_what_networks_need_is_named(tmp_path: Path, stand):
+    words = f"train {' '.join(stand.inputs)} --recipe paper --out {tmp_path / 'run'}"
+    done = in_a_process(words, before=NO_TORCH)
+    said = "error: networks need torch, which is not installed; pip install 'cpunet-hpge["
+    assert done.stderr.splitlines()[-1] == f"{said}networks]'"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.thorough
+def test_a_quick_demo_needs_no_torch_and_says_what_it_is(tmp_path: Path):
+    done = in_a_process(f"demo --quick --out {tmp_path / 'demo'}", before=NO_TORCH)
+    assert done.returncode == 0, done.stderr
+    report = tmp_path / "demo" / "report"
+    drawn = {path.stem for path in report.glob("*.svg")}
+    assert drawn == {"SEP_mean_pulse", "SEP_current_amplitude", "SEP_single_pulse"}
+    page = (report / "report.html").read_text()
+    assert "This is a quick look" in page
+    assert all(peak in page for peak in ("FEP", "SEP", "DEP"))

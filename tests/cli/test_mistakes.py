@@ -22,7 +22,7 @@ import yaml
 
 from cpunet.outputs import folder_written_aside
 from cpunet.training.run import RUN
-from synthetic import status_of, write_chain
+from synthetic import rows_of, status_of, write_chain
 
 # Commands that are right, unless a mistake gives an option another value.
 NEEDED = {
@@ -82,43 +82,33 @@ translate report sim.lh5 --out out | report: no finished run .*; make it with .*
 translate halfrun sim.lh5 --out out | halfrun.*; .*
 translate run sim.lh5 --out text.lh5/o | text.lh5/o: cannot be written \(.*\); .*another place
 """
-MISTAKES = {row: Mistake(*row.split(" | ")) for row in PLAIN.strip().splitlines()} | {
+MISTAKES = {row: Mistake(*row.split(" | ")) for row in rows_of(PLAIN)} | {
     f"stopped by {n.name}": Mistake(WRITE, r"interrupted; .*", signalled(n), 128 + n)
     for n in SIGNALS
 }
-MISTAKES |= {
-    "disk full": Mistake(
-        WRITE,
-        r"out.lh5: cannot be written \(No space left on device\); make room there, or .*",
-        failing("pathlib.Path.replace", FULL),
-    ),
-    "disk full for the terminal": Mistake(
-        "info sim.lh5",
-        r"sim.lh5: No space left on device; make room, or choose another place",
-        failing(DESCRIBE, FULL),
-    ),
-    "no GPU": Mistake(
-        "train --recipe paper --device cuda",
-        r"no GPU; use --device cpu or install .*",
-        lambda patch: patch.setattr("torch.cuda.is_available", lambda: False),
-    ),
-    "no memory": Mistake(
-        "info sim.lh5",
-        r"sim.lh5: out of memory \(Unable to allocate 6 GiB\); take fewer pulses, or .*",
-        failing(DESCRIBE, MemoryError("Unable to allocate 6 GiB")),
-    ),
-    "no memory on the GPU": Mistake(
-        "info sim.lh5",
-        r"sim.lh5: out of memory \(CUDA out of memory.*\); take fewer pulses, or .*",
-        failing(DESCRIBE, RuntimeError("CUDA out of memory. Tried\nto allocate")),
-    ),
-    "nobody's thought of": Mistake(
-        "info sim.lh5",
-        r"sim.lh5: unexpected KeyError \('dt'\); please report it to .* --debug prints",
-        failing(DESCRIBE, KeyError("dt")),
-        1,
-    ),
+FAULTS = {
+    "no disk": failing("pathlib.Path.replace", FULL),
+    "no room": failing(DESCRIBE, FULL),
+    "no GPU": lambda patch: patch.setattr("torch.cuda.is_available", lambda: False),
+    "memory": failing(DESCRIBE, MemoryError("Unable to allocate 6 GiB")),
+    "GPU memory": failing(DESCRIBE, RuntimeError("CUDA out of memory. Tried\nto allocate")),
+    "unexpected": failing(DESCRIBE, KeyError("dt")),
 }
+# the same, behind what is wrong with the machine
+FAULTY = r"""
+no disk | WRITE | out.lh5: cannot be written \(No space left on device\); make room there, or .*
+no room | info sim.lh5 | sim.lh5: No space left on device; make room, or choose another place
+no GPU | train --recipe paper --device cuda | no GPU; use --device cpu or install .*
+memory | info sim.lh5
+    | sim.lh5: out of memory \(Unable to allocate 6 GiB\); take fewer pulses, or .*
+GPU memory | info sim.lh5
+    | sim.lh5: out of memory \(CUDA out of memory.*\); take fewer pulses, or .*
+unexpected | info sim.lh5
+    | sim.lh5: unexpected KeyError \('dt'\); please report it to .* --debug prints
+"""
+for row in rows_of(FAULTY.replace("WRITE", WRITE)):
+    fault, words, line = row.split(" | ")
+    MISTAKES[fault] = Mistake(words, line, FAULTS[fault], 1 if fault == "unexpected" else 2)
 
 
 def fill(folder: Path, stand) -> None:

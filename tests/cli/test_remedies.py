@@ -19,7 +19,7 @@ from lgdo import Array
 
 from cpunet.pulses.reading import open_pulses
 from cpunet.pulses.writing import PulseWriter
-from synthetic import write_chain, write_table
+from synthetic import rows_of, write_chain, write_csv, write_table
 
 SHORT = {
     "CHECK": "check --sim sim.lh5 --data data.lh5",
@@ -42,7 +42,6 @@ class Remedy(NamedTuple):
     then: str = USED
 
 
-# a row goes on in lines that begin with spaces
 TABLE = r"""
 CHECK --data two.lh5 | tables of waveforms \((\S+), .*choose one with --table | --data-table {}
 CHECK --data channels.lh5 | choose one with --table (channel=1) .*or all for each
@@ -86,7 +85,6 @@ info sim.lh5 --set bias_V=3 | leave out --set | & info sim.lh5 | 90 of 225 sampl
 """
 for name, words in SHORT.items():
     TABLE = TABLE.replace(name, words)
-ROWS = re.sub(r"\n +", " ", TABLE).strip().splitlines()
 
 
 @pytest.fixture(scope="module")
@@ -94,11 +92,10 @@ def home(stand, tmp_path_factory):
     """The files that the commands are given."""
     folder = tmp_path_factory.mktemp("remedies")
     waves, kev, n = stand.data_waveforms, stand.data_kev, len(stand.data_kev)
-    for name, energies in {
-        "data": kev, "two": kev, "channels": kev, "mev": kev / 1000, "counts": 15 * kev,
-        "adc": kev, "nan": kev * np.nan, "zero": kev,
-    }.items():  # fmt: skip
-        stand.write(folder / f"{name}.lh5", "geds/raw", waves, energies)
+    energies = dict.fromkeys(("data", "two", "channels", "adc", "zero"), kev)
+    energies |= {"mev": kev / 1000, "counts": 15 * kev, "nan": kev * np.nan}
+    for name, values in energies.items():
+        stand.write(folder / f"{name}.lh5", "geds/raw", waves, values)
     sim = (stand.sim_waveforms, stand.sim_kev)
     stand.write(folder / "sim.lh5", "geds/sim", *sim, units="")
     stand.write(folder / "sim10.lh5", "geds/sim", *sim, units="", dt_ns=10)
@@ -124,11 +121,8 @@ def home(stand, tmp_path_factory):
     with h5py.File(folder / "hits.h5", "w") as file:
         for name, values in columns.items():
             file[f"default_ntuples/g4sntuple/{name}/pages"] = values
-    names = "".join(f"#column double {name}\n" for name in ("event", "x", "y", "z", "edep"))
-    rows = "".join(f"{i},{v},0,{v},900\n" for i, v in enumerate(x))
-    (folder / "plain.csv").write_text(
-        f"#class tools::wcsv::ntuple\n#separator 44\n{names}{rows}"
-    )
+    rows = [f"{i},{v},0,{v},900" for i, v in enumerate(x)]
+    write_csv(folder / "plain.csv", ["event", "x", "y", "z", "edep"], rows)
     write_chain(folder / "run", noise_kev=1.0)
     (folder / "data.lh5.out").write_bytes((folder / "sim.lh5").read_bytes())
     return folder
@@ -144,7 +138,7 @@ def last_of_each(text: str) -> list[str]:
     return words
 
 
-@pytest.mark.parametrize("row", ROWS)
+@pytest.mark.parametrize("row", rows_of(TABLE))
 def test_what_is_advised_is_taken(command, home, own_cache, monkeypatch, row):
     monkeypatch.chdir(home)
     remedy = Remedy(*row.split(" | "))

@@ -16,7 +16,7 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.hit_files import describe_hits, read_hits
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.simulation.simulate import HitFile
-from synthetic import one_line, write_table
+from synthetic import one_line, write_csv, write_table
 
 N = 12
 # deposits of each Geant4 event: a decay of two steps, and one of its daughter 3 s later
@@ -26,6 +26,8 @@ EDEP_KEV = np.tile([1500.0, 1114.5, 238.6], N)
 Z_MM = np.linspace(20, 30, 3 * N)
 # what a detector sees
 SEEN_KEV = [2614.5, 238.6] * N
+LAYOUTS = ("vectors", "flat", "csv", "hdf5")
+STEP = ["event", "Edep", "x", "y", "z"]
 
 Column = tuple[np.ndarray, str]
 
@@ -44,18 +46,10 @@ def remage(path: Path, columns: dict[str, Column], *, vectors: bool, table: str)
     return write_table(path, f"stp/{table}", **built)
 
 
-def csv_file(folder: Path, columns: list[str], rows: list[str], title: str = "hits") -> Path:
-    head = f"#class tools::wcsv::ntuple\n#title {title}\n#separator 44\n"
-    head += "".join(f"#column double {c}\n" for c in columns)
-    path = folder / "hits.csv"
-    path.write_text(head + "\n".join(rows))
-    return path
-
-
-def ntuple_csv(folder: Path, columns: dict[str, Column]) -> Path:
+def ntuple_csv(path: Path, columns: dict[str, Column]) -> Path:
     names = [f"{name}_in_{unit}" if unit else name for name, (_, unit) in columns.items()]
     rows = zip(*(values.tolist() for values, _ in columns.values()), strict=True)
-    return csv_file(folder, names, [",".join(map(str, row)) for row in rows])
+    return write_csv(path, names, [",".join(map(str, row)) for row in rows])
 
 
 def ntuple_hdf5(path: Path, columns: dict[str, Column], table: str = "det1") -> Path:
@@ -76,13 +70,10 @@ def steps(**changed: Column) -> dict[str, Column]:
 
 def written(folder: Path, layout: str, columns: dict[str, Column], table: str = "det1") -> Path:
     if layout == "csv":
-        return ntuple_csv(folder, columns)
+        return ntuple_csv(folder / "hits.csv", columns)
     if layout == "hdf5":
         return ntuple_hdf5(folder / "hits.hdf5", columns)
     return remage(folder / "hits.lh5", columns, vectors=layout == "vectors", table=table)
-
-
-LAYOUTS = ("vectors", "flat", "csv", "hdf5")
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -169,7 +160,7 @@ def test_joined_jobs_number_their_events_anew_and_threads_do_not(
 
 def test_joined_csv_files_are_read_as_jobs(tmp_path: Path) -> None:
     rows = [f"{i},{i + 1},1,2,3,{name}" for i in range(4) for name in ("V1", "B")]
-    alone = csv_file(tmp_path, [*STEP, "volume"], rows, title="steps data")
+    alone = write_csv(tmp_path / "hits.csv", [*STEP, "volume"], rows, title="steps data")
     alone.write_text("\n".join(3 * [alone.read_text()]))
     hits = read_hits(alone, HitOptions("V1"))
     assert hits.energy_kev.tolist() == [1000, 2000, 3000, 4000] * 3
@@ -275,19 +266,16 @@ def test_g4simple_is_in_mev_and_mm(tmp_path: Path) -> None:
 
 def test_g4simple_csv_and_bracketed_units(tmp_path: Path) -> None:
     rows = ["3,1,10,20,30", "3,0,0,0,0", "5,0.5,1,2,3"]
-    plain = csv_file(tmp_path, STEP, rows, title="steps data")
+    plain = write_csv(tmp_path / "hits.csv", STEP, rows, title="steps data")
     hits = read_hits(plain, HitOptions(origin=(1, 2, 50), flip_z=True))
     np.testing.assert_allclose(hits.energy_kev, [1000, 500])
     # a step without a deposit is none; y and z are turned about x
     np.testing.assert_allclose(hits.position_mm, [[9, -18, 20], [0, 0, 47]])
     named = ["event", "Edep [GeV]", "x [cm]", "y [cm]", "z [m]"]
     rows = ["3,0.001,10,20,30", "5,0.0005,1,2,3"]
-    hits = read_hits(csv_file(tmp_path, named, rows))
+    hits = read_hits(write_csv(tmp_path / "hits.csv", named, rows))
     np.testing.assert_allclose(hits.energy_kev, [1000, 500])
     np.testing.assert_allclose(hits.position_mm[0], [100, 200, 30_000])
-
-
-STEP = ["event", "Edep", "x", "y", "z"]
 
 
 @pytest.mark.parametrize(
@@ -304,7 +292,7 @@ STEP = ["event", "Edep", "x", "y", "z"]
 def test_bad_csv_is_one_line(
     tmp_path: Path, columns: list[str], rows: list[str], message: str
 ) -> None:
-    path = csv_file(tmp_path, columns, rows, title="steps data")
+    path = write_csv(tmp_path / "hits.csv", columns, rows, title="steps data")
     one_line(lambda: read_hits(path), message, str(path))
 
 
