@@ -38,6 +38,7 @@ from cpunet.networks import Stored
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.loading import InputSet
+from cpunet.pulses.preparation import Kind, Prepared, prepare
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import Columns, PulseWriter
 from cpunet.recipes.schema import PreparationConfig, Recipe
@@ -195,6 +196,14 @@ def small_sides() -> tuple[npt.NDArray[np.float32], npt.NDArray[np.float32]]:
     pulses = 1 / (1 + np.exp(-(time - 32 + 3 * width) / width))
     data = pulses[11:] * decay(32, 150, 64) + rng.normal(0, 0.003, (9, 64))
     return pulses[:11].astype(np.float32), data.astype(np.float32)
+
+
+def prepared_of(
+    raw: npt.ArrayLike, kind: Kind = "measured", dt_ns: float = DT_NS, **changes: Any
+) -> Prepared:
+    """Pulses prepared as recipes do, or with changes of that."""
+    config = PREPARATION.model_copy(update=changes)
+    return prepare(Pulses.of(raw, dt_ns=dt_ns), config, kind)
 
 
 def prepared_truth(path: Path, sim: InputSet, config: PreparationConfig) -> FloatArray:

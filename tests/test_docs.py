@@ -38,6 +38,12 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # only.
 TOO_LONG = {"simulation.md", "legend.md", "python.md"}
 MADE_BY_THE_SITE = ("reference/", "../reference/")
+DOCS = ROOT / "docs"
+HOOKS = DOCS / "hooks"
+NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
+BASH = "%%bash\n"
+PAGE = DOCS / "troubleshooting.md"
+QUOTED = re.findall(r"^\| `(.+?)` \|", PAGE.read_text(), re.MULTILINE)
 
 
 def blocks(*languages: str) -> list:
@@ -194,12 +200,6 @@ def test_the_first_tutorial_from_end_to_end(tmp_path):
         assert (tmp_path / made).exists()
 
 
-DOCS = ROOT / "docs"
-HOOKS = DOCS / "hooks"
-NOTEBOOKS = sorted(DOCS.rglob("*.ipynb"))
-BASH = "%%bash\n"
-
-
 def hook(name: str, needs: str) -> ModuleType:
     pytest.importorskip(needs)
     spec = importlib.util.spec_from_file_location(f"docs_hook_{name}", HOOKS / f"{name}.py")
@@ -300,10 +300,6 @@ def test_notebooks_run_from_top_to_bottom(notebook, tmp_path, monkeypatch):
         else:
             exec(compile(source, notebook.name, "exec"), names)
     assert (tmp_path / "report" / "report.html").exists()
-
-
-PAGE = DOCS / "troubleshooting.md"
-QUOTED = re.findall(r"^\| `(.+?)` \|", PAGE.read_text(), re.MULTILINE)
 
 
 def text_of(node: ast.AST) -> str:

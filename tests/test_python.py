@@ -32,6 +32,7 @@ from synthetic import FACTS, KEV, write_run, write_sides
 
 SHORT = {"training.steps": 20, "training.start_factors": [1], "scores.bootstraps": 20}
 N = 260
+NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e-\d+)?")
 
 
 @pytest.fixture(scope="module")
@@ -225,9 +226,6 @@ def test_a_recipe_and_settings_are_not_both_given():
     assert load_recipe(recipe, None) is recipe
     with pytest.raises(cpunet.CpunetError, match="leave settings out"):
         load_recipe(recipe, {"training.steps": 1})
-
-
-NUMBER = re.compile(r"\d+(?:\.\d+)?(?:e-\d+)?")
 
 
 def require_alike(printed: str, shown: str) -> None:

@@ -42,6 +42,11 @@ TEXTS = {
     "a: !!python/object/apply:os.system ['true']": "not YAML .*constructor",
     "dt_nz: 3": "dt_nz: no such setting; (did you mean dt_ns|there are )|: missing",
 }
+NUMBERS = {
+    "4.4e3": 4400.0, "9e-1": 0.9, "1e-05": 1e-5, "-.5E+3": -500.0, "1.": 1.0, "010": 10,
+    "0o10": 8, "0x1F": 31, "1_000": 1000, "true": True, "yes": "yes", "1:30": "1:30",
+    "2020-01-01": "2020-01-01", "~": None, "'1e3'": "1e3", "1e": "1e",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -81,13 +86,6 @@ def test_damaged_json(tmp_path: Path, text: str) -> None:
     path.write_bytes(text.encode("latin-1"))
     with pytest.raises(CpunetError, match=f"^{path}: damaged \\(.*\\); again$"):
         read_json(path, "again")
-
-
-NUMBERS = {
-    "4.4e3": 4400.0, "9e-1": 0.9, "1e-05": 1e-5, "-.5E+3": -500.0, "1.": 1.0, "010": 10,
-    "0o10": 8, "0x1F": 31, "1_000": 1000, "true": True, "yes": "yes", "1:30": "1:30",
-    "2020-01-01": "2020-01-01", "~": None, "'1e3'": "1e3", "1e": "1e",
-}  # fmt: skip
 
 
 def test_scalars_are_those_of_yaml_1_2_and_come_back_as_written(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ from cpunet.calibration.nuisances import named
 
 NUISANCES = tuple(named(name) for name in ("temperature", "hole_velocity_low", "cloud"))
 WIDTHS = np.array([n.prior for n in NUISANCES])
+ROWS, ACTS = 200, 2
 
 
 @pytest.fixture
@@ -49,9 +50,6 @@ def test_a_degenerate_pair_is_told_as_its_known_combination(correlation, n):
         assert pair.error == pytest.approx(0.8 * 0.1)
     # both known far better than before: two numbers
     assert not together(["a", "b"], 0.01 * covariance[:2, :2], np.zeros(2))
-
-
-ROWS, ACTS = 200, 2
 
 
 def selection(seed=0, size=6.0, begun=0.0) -> Linear:

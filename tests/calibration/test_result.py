@@ -22,6 +22,7 @@ from unpaired import DT_NS, charge, coarse
 SHORT = ("temperature", "impurity", "cloud", "self_repulsion", "diffusion")
 NUISANCES = tuple(named(name) for name in SHORT)
 PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), NUISANCES)
+EVENTS, FUNCTIONS, PARTS, TRUE = 240, 60, 8, 0.3
 
 
 def calibrated(values) -> CalibratedPhysics:
@@ -82,9 +83,6 @@ def test_what_cannot_be_is_no_finding(values, name, why):
     assert not any("no other physics are needed" in note for note in result.notes)
     assert result.comment.startswith(f"# {name}: unreliable value, makes up for something")
     assert result.comment.count("\n") == 1
-
-
-EVENTS, FUNCTIONS, PARTS, TRUE = 240, 60, 8, 0.3
 
 
 def estimate(rng: np.random.Generator) -> tuple[float, float, float, float]:

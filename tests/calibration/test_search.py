@@ -18,6 +18,8 @@ from cpunet.simulation.fields import solve
 from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import SimulationSettings
 
+PHYSICS = Physics(read_detector("icpc"), SimulationSettings(), NUISANCES)
+
 
 @given(st.floats(-3, -0.05), st.floats(0.1, 10))
 def test_a_search_that_goes_back_and_forth_ends_between(slope, begin):
@@ -102,9 +104,6 @@ def test_what_is_free_and_what_is_not():
     some, chosen, _ = freedom("li_thickness")
     assert chosen
     assert [nuisance.name for nuisance in some] == ["li_thickness_mm"]
-
-
-PHYSICS = Physics(read_detector("icpc"), SimulationSettings(), NUISANCES)
 
 
 @given(st.sampled_from(NUISANCES), st.floats(-0.5, 0.5))

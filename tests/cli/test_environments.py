@@ -1,11 +1,13 @@
-"""Environments of containers, batch systems and scripts; readouts without torch."""
+"""Environments of containers, batch systems and scripts; no torch; interruptions."""
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numba
@@ -14,7 +16,21 @@ import pytest
 
 import cpunet
 from cpunet.kernels import kernel
-from synthetic import in_a_process, write_chain
+from cpunet.training.unfinished import UnfinishedRun
+from synthetic import digests, in_a_process, write_chain
+
+NO_TORCH = """
+import sys
+
+class Missing:
+    def find_spec(self, name, path=None, target=None):
+        if name.partition(".")[0] == "torch":
+            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
+
+sys.meta_path.insert(0, Missing())
+"""
+KEPT = ["--set", "training.checkpoint_interval=1", "--set", "training.log_interval=1"]
+SEED = ("--seed", "3")  # of the fixture `trained`
 
 
 def python(*words: object, status: int = 0, **environment: str) -> str:
@@ -96,18 +112,6 @@ def test_a_signal_that_is_ignored_stays_so(command, stand, monkeypatch, name):
         signal.signal(number, signal.SIG_DFL)
 
 
-NO_TORCH = """
-import sys
-
-class Missing:
-    def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] == "torch":
-            raise ModuleNotFoundError(f"No module named {name!r}", name=name)
-
-sys.meta_path.insert(0, Missing())
-"""
-
-
 def test_a_readout_is_used_without_torch(tmp_path: Path, stand):
     run, outs = write_chain(tmp_path / "run", noise_kev=2), [tmp_path / n for n in "abc"]
     done = in_a_process(
@@ -138,3 +142,51 @@ def test_a_quick_demo_needs_no_torch_and_says_what_it_is(tmp_path: Path):
     page = (report / "report.html").read_text()
     assert "This is a quick look" in page
     assert all(peak in page for peak in ("FEP", "SEP", "DEP"))
+
+
+def at_state(monkeypatch, number: int, act: Callable[[], None]) -> None:
+    """Do something when so many states were stored."""
+    save, calls = UnfinishedRun.save, []
+
+    def watched(self, state):
+        save(self, state)
+        calls.append(0)
+        if len(calls) == number:
+            act()
+
+    monkeypatch.setattr(UnfinishedRun, "save", watched)
+
+
+@pytest.fixture
+def words(stand, tiny, tmp_path) -> list[object]:
+    return ["train", *stand.inputs, "--out", tmp_path / "run", *SEED, *tiny, *KEPT]
+
+
+@pytest.mark.parametrize(
+    "how",
+    [
+        pytest.param(signal.SIGTERM, id="TERM"),
+        pytest.param(signal.SIGINT, id="INT", marks=pytest.mark.thorough),
+    ],
+)
+def test_a_signal_stops_between_two_iterations(
+    command, words, trained, tmp_path, monkeypatch, how
+):
+    before = signal.signal(how, signal.SIG_DFL)  # which a process of tests may ignore
+    with monkeypatch.context() as patched:
+        at_state(patched, 2, lambda: signal.raise_signal(how))
+        stopped = command(*words)
+    signal.signal(how, before)
+    assert stopped.code == 128 + how
+    assert stopped.out == ""
+    told = stopped.err.splitlines()
+    assert "stopping after this iteration; once more to stop at once" in told
+    assert "stopped after 3 of 4 iterations; resume goes on from it" in told
+    assert told[-1].startswith("error: interrupted")
+    assert [path.name for path in tmp_path.iterdir()] == ["run.unfinished"]
+    assert command(*words, "--resume").code == 0
+    assert [path.name for path in tmp_path.iterdir()] == ["run"]
+    assert digests(tmp_path / "run") == digests(trained)
+    assert [path.name for path in tmp_path.glob("run/*checkpoint*")] == []
+    info = json.loads((tmp_path / "run" / "run.json").read_text())
+    assert info["resumed_at"] == [3]

@@ -26,6 +26,9 @@ DT_NS = 16.0
 ADC_PER_KEV, NOISE_KEV = 15.0, 1.5
 # Prepared pulses are scaled to 0.8 of a tail that has decayed by 11 %.
 TO_PREPARED = 0.8 / np.exp(-397 * DT_NS / 54_600)
+GRID, SPECTRUM = 8192, read_electronics("legend200").noise.spectrum
+FAST = load_recipe("fast").preparation
+WANTED = NOISE_KEV * TO_PREPARED
 
 
 def coloured(n: int, length: int, rng: np.random.Generator) -> np.ndarray:
@@ -93,9 +96,6 @@ def test_bad_input_is_named(noise) -> None:
             BaselineNoise.of(Baselines.of([raw], CONFIG))
     with pytest.raises(CpunetError, match="pulse 1 has an energy of nan keV"):
         noise.draw(np.array([1.0, np.nan]), 100, np.random.default_rng(0))
-
-
-GRID, SPECTRUM = 8192, read_electronics("legend200").noise.spectrum
 
 
 def on_baselines(baselines: np.ndarray, kev: float = 2000.0) -> Pulses:
@@ -185,10 +185,6 @@ def test_what_has_no_noise_or_no_energy_is_left_out() -> None:
     assert noise.rms / TO_PREPARED == pytest.approx(1, abs=0.02)
     with pytest.raises(CpunetError, match="most baselines are constant"):
         BaselineNoise.of(Baselines.of([on_baselines(0 * baselines[:100])], CONFIG))
-
-
-FAST = load_recipe("fast").preparation
-WANTED = NOISE_KEV * TO_PREPARED
 
 
 def as_input(raw: Pulses) -> InputSet:

@@ -20,6 +20,11 @@ from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
 from synthetic import load_recipe, mean_kev
 
 TH228 = (10, 60, 85, 155, 235, 240, 365, 560, 720, 1980, 2615)
+RECIPE = load_recipe("fast")
+PREPARATION = RECIPE.preparation
+LAW = TailsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)
+BELOW_30 = tuple(float(kev < 30) for kev in SIZES_KEV)
+DRAWN = DrawnTails(**asdict(LAW), height=0.9, lead_us=0.5, dt_ns=16.0, passed=BELOW_30)
 
 
 @pytest.mark.parametrize("rate_khz", [0.3, 3.0])
@@ -43,10 +48,6 @@ def test_the_rate_is_found_with_little_and_with_much_noise(error_kev: float):
     found = fit_rate(measured, error_kev, 54.6, energies)
     assert found.law.rate_khz == pytest.approx(1.5, abs=3 * found.rate_error_khz)
     assert found.sigma_kev == pytest.approx(error_kev, rel=0.05)
-
-
-RECIPE = load_recipe("fast")
-PREPARATION = RECIPE.preparation
 
 
 def traces_of(
@@ -155,11 +156,6 @@ def test_what_cannot_be_told_is_said_in_a_line(busy: RawTraces, change, said: st
 def test_more_pulses_than_memory_holds_are_refused():
     with pytest.raises(CpunetError, match="give a lower rate, or a shorter decay or record"):
         TailsLaw(0.02, 1e12, TH228).draw(1000, np.random.default_rng(1))
-
-
-LAW = TailsLaw(2.0, 54.6, read_electronics("ornl").other_pulses_kev)
-BELOW_30 = tuple(float(kev < 30) for kev in SIZES_KEV)
-DRAWN = DrawnTails(**asdict(LAW), height=0.9, lead_us=0.5, dt_ns=16.0, passed=BELOW_30)
 
 
 def test_what_cuts_take_is_not_drawn():

@@ -33,6 +33,9 @@ from synthetic import PADDING_BEFORE, load_recipe, mean_kev, one_line
 
 PRESETS = ("legend200", "ornl", "ringing", "mjd")
 T_NS = np.arange(0, 20_000, 0.5)
+CONFIG = load_recipe("paper").preparation
+DT_NS, DECAY_NS = 16.0, 54_600.0
+QUIET = {"rms_kev": 0.0, "spectrum": read_electronics("ornl").noise.spectrum}
 
 
 def altered(name: str = "legend200", **values: object) -> Electronics:
@@ -110,10 +113,6 @@ def test_impossible_chains_name_the_field(tmp_path: Path, values: dict):
     one_line(lambda: read_electronics(path), *values, str(path))
 
 
-CONFIG = load_recipe("paper").preparation
-DT_NS, DECAY_NS = 16.0, 54_600.0
-
-
 @pytest.mark.parametrize("late", [-3, 0, 5])
 def test_windows_go_on_with_their_decay_wherever_their_maximum_is(late: int) -> None:
     """A network does not place the maximum of its output exactly."""
@@ -130,9 +129,6 @@ def test_windows_go_on_with_their_decay_wherever_their_maximum_is(late: int) -> 
     records = with_room(windows, CONFIG, DT_NS)
     assert (records[0, -300:] == 1).all()
     assert np.isnan(records[1]).all()
-
-
-QUIET = {"rms_kev": 0.0, "spectrum": read_electronics("ornl").noise.spectrum}
 
 
 def rates(rate_kHz: float = 0.0, pile_up_kHz: float = 0.0) -> dict[str, object]:

@@ -38,6 +38,8 @@ from synthetic import after_pole_and_decay, one_line, sampled, write_chain, writ
 R, Z = np.arange(6.0), np.arange(8.0)
 WAVEFORMS = ("waveform_000_deg", "waveform_045_deg")
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
+FINE = 8  # samples of the charge to one of a template
+POLE = ("generator.poles_ns=[50]", "generator.decay_us=60")
 
 
 def charge(n_samples: int = 2400) -> np.ndarray:
@@ -313,10 +315,6 @@ def test_reboost_gives_the_a_over_e_of_charges_drifted_one_by_one(
     np.testing.assert_allclose(apart[:60], 0, atol=1e-3)
     # reboost looks every 20 ns first, and may take the lower one of two maxima
     assert (apart[60:] < 2e-3).mean() > 0.9
-
-
-FINE = 8  # samples of the charge to one of a template
-POLE = ("generator.poles_ns=[50]", "generator.decay_us=60")
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The chain against the exact one of the test stands."""
+"""The chain against the exact one of the test stands; its inverse with known weights."""
 
 from __future__ import annotations
 
@@ -8,12 +8,16 @@ import pytest
 
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.electronics.readout import linear_response
+from cpunet.networks import generators
+from cpunet.networks.generators import LinearInverse
 from cpunet.networks.response_layer import DriftClock, ElectronicsResponse
 from cpunet.pulses.container import Pulses
 from cpunet.recipes.schema import ResponseConfig
-from synthetic import PADDING_AFTER, PADDING_BEFORE
+from synthetic import PADDING_AFTER, PADDING_BEFORE, load_recipe
 
-DT_NS, FINE_PER_SAMPLE, SAMPLES = 16.0, 16, 800
+DT_NS, FINE_PER_SAMPLE, SAMPLES, END = 16.0, 16, 800, 400
+# of 12, 20, 12 to 8, and 8 samples
+STRETCHES = {"before_ns": 192, "after_ns": 320, "baseline_ns": (192, 128), "level_ns": 128}
 
 
 def electronics(poles: tuple[float, ...]) -> Electronics:
@@ -102,9 +106,6 @@ def test_pulses_of_any_height_and_time():
     np.testing.assert_allclose(moved[:, 7:-7], 3 * records[:, :-14], atol=1e-5)
 
 
-END = 400
-
-
 def rise(before_us: np.ndarray, long_us: float) -> np.ndarray:
     """Charge by the time before the end, smooth at both of its ends."""
     along = np.clip(1 - before_us / long_us, 0, 1)
@@ -123,3 +124,25 @@ def test_a_stretched_drift_is_a_longer_one_by_a_factor_that_may_change(long_us, 
     expected = rise(before - late + late / (1 + a + b * late), long_us)
     assert np.abs(found - expected).max() < 1e-4
     assert np.abs(found - charge).max() > 100 * 1e-4
+
+
+def edges(*starts: int) -> npt.NDArray[np.float32]:
+    """Ramps of four samples from 0 to 1."""
+    time = np.arange(60, dtype=np.float32)
+    return np.stack([((time - start) / 4).clip(0, 1) for start in starts])
+
+
+def test_it_gives_back_what_it_gets_about_the_half_maximum_and_0_and_1_beyond(monkeypatch):
+    monkeypatch.setattr(generators, "AFTER_NS", 128.0)
+    config = load_recipe("fast").matching.training.model_copy(update=STRETCHES)
+    identity = LinearInverse(60, config)
+    identity.half_height[...] = 0.5
+    identity.weights[...] = np.eye(20)
+    pulses = 0.9 * edges(25, 30, 33) + np.float32(0.05)  # of any offset and height
+    pulses[0, :5] += 0.2
+    pulses[0, 55:] -= 0.3
+    pulses[1] = float("nan")  # has nothing to say to others
+    result = identity(pulses)
+    assert result.dtype == np.float32
+    assert np.isnan(result[1]).any()
+    np.testing.assert_allclose(result[[0, 2]], edges(25, 33), atol=1e-5, rtol=1e-5)

@@ -21,13 +21,18 @@ from synthetic import one_line, waveform_table, write_table
 N, LENGTH = 12, 40
 RAW = np.random.default_rng(1).integers(0, 60000, (N, LENGTH), dtype=np.uint16)
 KEV = np.linspace(100, 2000, N)
+HALF, PAIRS = np.tile([3, 7], N // 2), np.repeat([0, 1], N // 2)
+BROKEN = {
+    "other file": h5py.ExternalLink("none.lh5", "ch/raw"),
+    "other table": h5py.ExternalLink("two.lh5", "none"),
+    "soft": h5py.SoftLink("/none"),
+    "loop": h5py.SoftLink("/raw/loop"),
+}
+COMPOUND = np.zeros(N, [("energy", "f8"), ("waveform", "u2", (LENGTH,))])
 
 
 def write(path: Path, table: str = "raw", traces=RAW, kev=KEV, **columns) -> Path:
     return write_table(path, table, traces, kev, **columns)
-
-
-HALF, PAIRS = np.tile([3, 7], N // 2), np.repeat([0, 1], N // 2)
 
 
 @pytest.mark.parametrize(
@@ -142,14 +147,6 @@ def test_columns_that_are_links_to_other_files(tmp_path, part):
     np.testing.assert_array_equal(pulses.energy_kev, KEV + (part == "energy"))
 
 
-BROKEN = {
-    "other file": h5py.ExternalLink("none.lh5", "ch/raw"),
-    "other table": h5py.ExternalLink("two.lh5", "none"),
-    "soft": h5py.SoftLink("/none"),
-    "loop": h5py.SoftLink("/raw/loop"),
-}
-
-
 @pytest.mark.parametrize("kind", BROKEN)
 @pytest.mark.parametrize("place", ["ch2", "ch2/raw", "raw/energy"])
 def test_a_broken_link_is_named_with_its_target(tmp_path, kind, place):
@@ -167,9 +164,6 @@ def test_a_broken_link_is_named_with_its_target(tmp_path, kind, place):
     if kind != "loop":
         energy = f"{tmp_path}/one.lh5:{place}/energy".replace("energy/energy", "energy")
         one_line(lambda: open_pulses(tmp_path / "two.lh5", energy=energy), *said)
-
-
-COMPOUND = np.zeros(N, [("energy", "f8"), ("waveform", "u2", (LENGTH,))])
 
 
 @pytest.mark.parametrize(

@@ -29,6 +29,7 @@ RECIPE = load_recipe("fast")
 FEP = parse_selection("FEP", RECIPE.peaks)
 DT_NS, N, BASE, GAIN, DECAY = 16.0, 400, 2000.0, 4.0, 3750.0  # decay in samples
 LINES = np.array([2614.511, 2103.511, 1592.511, 900.0])
+TIME = np.arange(800)
 
 
 def kev(seed: int = 0) -> np.ndarray:
@@ -136,9 +137,6 @@ def test_the_advice_on_counts_that_roll_over_works_on_integers(tmp_path, kind):
     heights = np.ptp(whole, axis=1) / np.ptp(counts, axis=1)
     np.testing.assert_allclose(heights, 3 if kind == "int16" else 1)
     assert ("view('uint16')" in str(error.value)) == (kind == "int16")
-
-
-TIME = np.arange(800)
 
 
 def charge(n: int = 40) -> np.ndarray:

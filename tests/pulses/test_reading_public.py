@@ -15,6 +15,18 @@ from cpunet.errors import CpunetError
 from cpunet.pulses.reading import open_pulses, table_sizes
 
 KEV = 2614.511
+TEXT = {"wf": np.zeros(40), "energy": "much"}
+DEFECTS = {
+    "no period": ({"dt_ns": None}, r"the sampling period is not in the file; give `dt_ns`"),
+    "a table": ({"table": "x"}, r"has no tables; leave out `table`"),
+    "no pulse": ({"then": 5}, r"entry 3 is no pulse \(a dictionary of wf"),
+    "no numbers": ({"then": TEXT}, r"entry 3 is no pulse .* numbers\); write the pulses"),
+    "other length": ({"then": {"wf": np.zeros(39)}}, r"3: 39 samples, before it 40; write the"),
+    "cut off": ({"cut": 20}, r"breaks off after \d entries .*; download it again"),
+    "empty list": ({"only": []}, r"pickled pulses holds no pulses; give a file with events"),
+    "no pulses": ({"only": "words"}, r"entry 0 is no pulse"),
+}
+LENGTH = 64
 
 
 def test_the_layout_of_the_majorana_release(tmp_path):
@@ -67,19 +79,6 @@ def test_pickled_pulses(tmp_path, lists):
     assert open_pulses(file, energy="tp0", kev_per_adc=2, dt_ns=16).read().energy_kev[1] == 802
 
 
-TEXT = {"wf": np.zeros(40), "energy": "much"}
-DEFECTS = {
-    "no period": ({"dt_ns": None}, r"the sampling period is not in the file; give `dt_ns`"),
-    "a table": ({"table": "x"}, r"has no tables; leave out `table`"),
-    "no pulse": ({"then": 5}, r"entry 3 is no pulse \(a dictionary of wf"),
-    "no numbers": ({"then": TEXT}, r"entry 3 is no pulse .* numbers\); write the pulses"),
-    "other length": ({"then": {"wf": np.zeros(39)}}, r"3: 39 samples, before it 40; write the"),
-    "cut off": ({"cut": 20}, r"breaks off after \d entries .*; download it again"),
-    "empty list": ({"only": []}, r"pickled pulses holds no pulses; give a file with events"),
-    "no pulses": ({"only": "words"}, r"entry 0 is no pulse"),
-}
-
-
 @pytest.mark.parametrize("defect", DEFECTS)
 def test_what_is_wrong_with_a_pickle_is_one_line(tmp_path, defect):
     how, words = DEFECTS[defect]
@@ -93,9 +92,6 @@ def test_what_is_wrong_with_a_pickle_is_one_line(tmp_path, defect):
     options = {"dt_ns": 16} | {k: v for k, v in how.items() if k in ("dt_ns", "table")}
     with pytest.raises(CpunetError, match=words):
         open_pulses(file, **options).read()
-
-
-LENGTH = 64
 
 
 def frame(kind: str, *values) -> bytes:

@@ -12,12 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
 from cpunet.pulses.peaks import label_peaks, parse_selection
-from cpunet.pulses.preparation import Prepared, apply_cuts, fit_cuts, prepare
+from cpunet.pulses.preparation import Prepared, apply_cuts, fit_cuts
 from cpunet.recipes.schema import CutConfig, PeakConfig
-from synthetic import PREPARATION, load_recipe
+from synthetic import load_recipe, prepared_of
 
+CUTS = CutConfig(decay_sigmas=6.0, chi2_sigmas=6.0, baseline_sigmas=6.0)
+Array = npt.NDArray[np.float64]
 LINES = {
     "FEP": PeakConfig(energy_kev=2614.511, half_width_kev=5),
     "SEP": PeakConfig(energy_kev=2103.511, half_width_kev=5),
@@ -56,10 +57,9 @@ def test_selections(text, expected):
     assert selection.select(values).astype(int).tolist() == expected
 
 
-NEITHER = ["fep", "", "FEP,", "-300", "300", "a-b", "nan-", "1-2-3", "3000-300"]
-
-
-@pytest.mark.parametrize("text", NEITHER)
+@pytest.mark.parametrize(
+    "text", ["fep", "", "FEP,", "-300", "300", "a-b", "nan-", "1-2-3", "3000-300"]
+)
 def test_what_is_neither_line_nor_range_is_refused(text):
     said = r"no known peak \(FEP, SEP, DEP\)[^\n]*300-3000"
     said = "'3000-300' is empty; give the lower end first" if text == "3000-300" else said
@@ -74,10 +74,6 @@ def test_lines_in_ranges_are_those_not_chosen_by_name() -> None:
     assert parse_selection("FEP,DEP,1500-2700", peaks).lines_in_ranges == ["SEP"]
 
 
-CUTS = CutConfig(decay_sigmas=6.0, chi2_sigmas=6.0, baseline_sigmas=6.0)
-Array = npt.NDArray[np.float64]
-
-
 def pulse(start: float, tau_samples: float = 3750.0) -> Array:
     t = np.maximum(np.arange(1200) - start, 0)
     return np.asarray((1 - np.exp(-((t / 20) ** 2))) * np.exp(-t / tau_samples))
@@ -88,10 +84,6 @@ def traces(amplitudes: Array, seed: int = 0) -> Array:
     noise = rng.normal(0, 10, (len(amplitudes), 1200))
     offsets = rng.normal(14_000, 30, (len(amplitudes), 1))
     return np.asarray(offsets + amplitudes[:, None] * pulse(560) + noise)
-
-
-def prepared_of(raw: Array) -> Prepared:
-    return prepare(Pulses.of(raw, dt_ns=16), PREPARATION, "measured")
 
 
 @pytest.fixture(scope="module")

@@ -17,6 +17,7 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulator import Simulator
 
 STEPS = SimulationSettings(dt_ns=1, length_ns=3000)
+component = st.floats(-4000, 4000, allow_nan=False)
 
 
 def drift_paths(fields: FieldMaps, *places: npt.ArrayLike) -> tuple[np.ndarray, np.ndarray]:
@@ -50,9 +51,6 @@ def test_reference_paths(reference_data: Path, reference_maps: FieldMaps) -> Non
     assert np.nanmax(holes) < 0.005
     assert np.median(np.nanmax(electrons, axis=1)) < 0.001
     assert np.nanmax(electrons) < 0.1
-
-
-component = st.floats(-4000, 4000, allow_nan=False)
 
 
 @pytest.mark.parametrize("temperature", [77, 90])

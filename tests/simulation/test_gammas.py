@@ -30,6 +30,12 @@ from cpunet.simulation.hits import Hits
 from cpunet.simulation.outline import outline_of
 from cpunet.simulation.simulator import merge_hits
 
+FEP = EnergyWindow("FEP", 2613.5, 2615.5)
+DEP, SEP = EnergyWindow("DEP", 1591.0, 1594.0), EnergyWindow("SEP", 2102.0, 2105.0)
+LINES = {DEP: 1500, SEP: 800, FEP: 800}
+# Geant4 11.4, option0: hit, FEP, SEP, DEP per gamma in the cone
+GEANT4 = {20: (0.4265, 0.0997, 0.01131, 0.00370), 100: (0.4450, 0.1101, 0.01199, 0.00386)}
+
 
 def crystal(**changed: float) -> Detector:
     """The crystal of the Geant4 reference: a cylinder with a bore."""
@@ -40,13 +46,6 @@ def crystal(**changed: float) -> Detector:
         "temperature_K": 90.0,
     }  # fmt: skip
     return Detector.model_validate(values | changed)
-
-
-FEP = EnergyWindow("FEP", 2613.5, 2615.5)
-DEP, SEP = EnergyWindow("DEP", 1591.0, 1594.0), EnergyWindow("SEP", 2102.0, 2105.0)
-LINES = {DEP: 1500, SEP: 800, FEP: 800}
-# Geant4 11.4, option0: hit, FEP, SEP, DEP per gamma in the cone
-GEANT4 = {20: (0.4265, 0.0997, 0.01131, 0.00370), 100: (0.4450, 0.1101, 0.01199, 0.00386)}
 
 
 def run(height: float, n: int, seed: int = 3, **more: object) -> tuple[Hits, int]:

@@ -16,17 +16,22 @@ from cpunet.simulation.geometry_readers import read_detector
 from cpunet.simulation.settings import Shift, SimulationSettings
 
 ICPC = read_detector("icpc")
-
-
-def changed(**values: object) -> Detector:
-    return Detector.model_validate({**ICPC.model_dump(), **values})
-
-
 CYLINDERS = {
     "top_cylinder_length": 20, "top_cylinder_radius": 33, "bottom_cylinder_length": 25,
     "bottom_cylinder_radius": 36, "bottom_transition_length": 6, "top_groove_depth": 9,
     "top_groove_radius": 19, "outer_taper_length": 0,
 }  # fmt: skip
+LONG = {"siggen_conventions": False, "outer_taper_length": 0}
+TEN, TWENTY = math.radians(10), math.radians(20)
+R, L, BORE = ICPC.crystal_radius, ICPC.crystal_length, ICPC.bore_radius
+BORE_END = L - ICPC.bore_length + BORE
+SLOPE = math.hypot(6, 4.45)  # of the transition, 6 mm along the axis
+NO_BORE = dict.fromkeys(("bore_length", "bore_radius", "bore_bullet_radius"), 0)
+NO_DITCH = dict.fromkeys(("wrap_around_radius", "ditch_depth", "ditch_thickness"), 0)
+
+
+def changed(**values: object) -> Detector:
+    return Detector.model_validate({**ICPC.model_dump(), **values})
 
 
 def test_rounded_walls_follow_their_profiles() -> None:
@@ -45,13 +50,6 @@ def test_rounded_walls_follow_their_profiles() -> None:
         at = clear & np.isfinite(wall)
         assert detector.inside(wall + inwards, z)[at].all()
         assert not detector.inside(wall - inwards, z)[at].any()
-
-
-LONG = {"siggen_conventions": False, "outer_taper_length": 0}
-TEN, TWENTY = math.radians(10), math.radians(20)
-R, L, BORE = ICPC.crystal_radius, ICPC.crystal_length, ICPC.bore_radius
-BORE_END = L - ICPC.bore_length + BORE
-SLOPE = math.hypot(6, 4.45)  # of the transition, 6 mm along the axis
 
 
 @pytest.mark.parametrize(("change", "place", "inwards"), [
@@ -101,10 +99,6 @@ def test_impurities_follow_their_terms() -> None:
     radial = changed(impurity_radial_mult=1.5, impurity_radial_add_1e10_per_cm3=-0.1)
     r = ICPC.crystal_radius
     assert radial.impurity_1e10_per_cm3(r, 0) == pytest.approx(-1.8 * 1.5 - 0.1)
-
-
-NO_BORE = dict.fromkeys(("bore_length", "bore_radius", "bore_bullet_radius"), 0)
-NO_DITCH = dict.fromkeys(("wrap_around_radius", "ditch_depth", "ditch_thickness"), 0)
 
 
 @pytest.mark.parametrize(

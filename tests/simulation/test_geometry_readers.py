@@ -49,6 +49,16 @@ DIODE: dict[str, Any] = {
         "manufacturer": {"recommended_voltage_in_V": 3500, "dl_thickness_in_mm": 0.7}
     },
 }
+CRYSTAL: dict[str, Any] = {
+    "impurity_curve": {
+        "model": "parabolic_exponential_boule",
+        "parameters": {"a": 9.0, "b": 0.05, "c": -1e-4, "n": 0.3, "l": 60.0, "m": 20.0},
+        "corrections": {"scale": 1.2, "offset": -0.4},
+    },
+    "slices": {"A": {"detector_offset_in_mm": 90.0}, "B": {"detector_offset_in_mm": 40}},
+}
+TAPERED = "outer_taper_length 20\nouter_taper_width 4\ninner_taper_length 45"
+RADIAL = "impurity_radial_add -0.4\nimpurity_radial_mult 1.5"
 
 
 def written(folder: Path, name: str, text: str) -> Path:
@@ -104,16 +114,6 @@ def test_a_legend_diode(tmp_path: Path, suffix: str, caplog) -> None:
     assert (detector.wrap_around_radius, detector.ditch_thickness) == (10.5, 3)
     assert (detector.outer_taper_length, detector.taper_angle_deg) == (5, 45)
     assert (detector.bias_V, detector.li_thickness) == (3500, 0.7)
-
-
-CRYSTAL: dict[str, Any] = {
-    "impurity_curve": {
-        "model": "parabolic_exponential_boule",
-        "parameters": {"a": 9.0, "b": 0.05, "c": -1e-4, "n": 0.3, "l": 60.0, "m": 20.0},
-        "corrections": {"scale": 1.2, "offset": -0.4},
-    },
-    "slices": {"A": {"detector_offset_in_mm": 90.0}, "B": {"detector_offset_in_mm": 40}},
-}
 
 
 def acceptors_1e9(z_boule: Array, *, a: float, b: float, **more: float) -> Array:
@@ -264,10 +264,6 @@ def test_diodes_that_cannot_be_simulated(tmp_path, change: dict[str, Any], said:
     geometry = {k: v for k, v in (DIODE["geometry"] | change).items() if v is not None}
     diode = DIODE | (change if change.keys() <= DIODE.keys() else {"geometry": geometry})
     assert said in refused(written(tmp_path, "B.json", json.dumps(diode)), "temperature_K=90")
-
-
-TAPERED = "outer_taper_length 20\nouter_taper_width 4\ninner_taper_length 45"
-RADIAL = "impurity_radial_add -0.4\nimpurity_radial_mult 1.5"
 
 
 def siggen(folder: Path, more: str = "", without: str = "#") -> Detector:

@@ -30,6 +30,11 @@ LAYOUTS = ("vectors", "flat", "csv", "hdf5")
 STEP = ["event", "Edep", "x", "y", "z"]
 
 Column = tuple[np.ndarray, str]
+JOINED = [3, 3, 8, 8, 9, 9, 2, 2, 3, 3, 8, 8]
+# two threads with even and odd events; the blocks end within 4 and 5
+THREADS = [0, 2, 4, 1, 3, 5, 4, 6, 5, 7, 8, 9]
+GOOD = {"x_mm": [1.0, 2, 3], "y_mm": [0.0, 0, 0], "z_mm": [10.0, 20, 30]}
+GOOD |= {"edep_keV": [500.0, 600, 700], "offsets": [0, 2, 3]}
 
 
 def remage(path: Path, columns: dict[str, Column], *, vectors: bool, table: str) -> Path:
@@ -134,11 +139,6 @@ def test_links_to_steps_of_other_files(tmp_path: Path) -> None:
     (tmp_path / "two.lh5").unlink()
     with pytest.raises(CpunetError, match=r"two is a link to two.lh5:stp/"):
         read_hits(tmp_path / "all.h5", HitOptions("one"))
-
-
-JOINED = [3, 3, 8, 8, 9, 9, 2, 2, 3, 3, 8, 8]
-# two threads with even and odd events; the blocks end within 4 and 5
-THREADS = [0, 2, 4, 1, 3, 5, 4, 6, 5, 7, 8, 9]
 
 
 @pytest.mark.parametrize("layout", ["flat", "csv", "hdf5"])
@@ -302,10 +302,6 @@ def test_foreign_files_are_one_line(tmp_path: Path, content: bytes) -> None:
     path.write_bytes(content)
     with pytest.raises(CpunetError, match="foreign: "):
         read_hits(path)
-
-
-GOOD = {"x_mm": [1.0, 2, 3], "y_mm": [0.0, 0, 0], "z_mm": [10.0, 20, 30]}
-GOOD |= {"edep_keV": [500.0, 600, 700], "offsets": [0, 2, 3]}
 
 
 @pytest.mark.parametrize(

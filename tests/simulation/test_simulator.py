@@ -27,6 +27,10 @@ SIGGEN = PLAIN.model_copy(
 
 
 ICPC = read_detector("icpc")  # at 90 K, as the reference pulses
+Array = npt.NDArray[np.float64]
+TABLE = velocity_table(90)
+RATES = {"hole_trapping_per_us": 2.0, "electron_trapping_per_us": 5.0}
+TRAPPED = SimulationSettings(dt_ns=1, length_ns=2400, diffusion=False, cloud_fwhm_mm=0)
 
 
 def siggen(folder: Path, kind: str) -> dict[str, np.ndarray]:
@@ -109,12 +113,6 @@ def test_reference_clouds(reference_data: Path, reference_maps: FieldMaps) -> No
     strong = SIGGEN.model_copy(update={"self_repulsion": True})
     widths = of(reference_maps, strong).signals(*start.T, 2000.0).cloud_fwhm_ns
     assert np.abs(widths - data["fwhm_steps_ene2000"]).max() <= 1
-
-
-Array = npt.NDArray[np.float64]
-TABLE = velocity_table(90)
-RATES = {"hole_trapping_per_us": 2.0, "electron_trapping_per_us": 5.0}
-TRAPPED = SimulationSettings(dt_ns=1, length_ns=2400, diffusion=False, cloud_fwhm_mm=0)
 
 
 def hecht(t_ns: Array, path_mm: float, carrier: int, rate_per_us: float) -> Array:

@@ -39,6 +39,8 @@ DT_NS = 16.0
 ERRORS = {"log_poles_ns.1": 0.02, "log_poles_ns.2": 0.05, "log_decay_us.1": 0.01}
 ERRORS |= {"slow_weights.3": 0.004, "decay_weights.1": 0.002}
 FIT = {"chi_square": 120.0, "moments": 80, "steps": 9, "errors": ERRORS, "pulls": {}}
+FEW = load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"])
+RESPONSE = ElectronicsResponse(FEW.matching[0], DT_NS)
 
 
 def write_response(
@@ -243,10 +245,6 @@ def test_a_poor_fit_is_doubted(run, tmp_path):
     early = write_response(tmp_path / "early", slow={0: -0.4, 2: -0.2})
     (said,) = response(early).runs[0].doubts
     assert said.startswith("60 % of the charge would arrive too early")
-
-
-FEW = load_recipe("fast", ["generator.slow_ns=[400]", "generator.fast_decays_us=[]"])
-RESPONSE = ElectronicsResponse(FEW.matching[0], DT_NS)
 
 
 def numbers(response: ElectronicsResponse) -> dict[str, float]:

@@ -37,6 +37,9 @@ RECIPE = load_recipe("fast", CHAIN)
 DT_NS, NOISE_KEV, KEV = 16.0, 3.0, 2000.0
 FINE = 16  # samples of the charge to one of the digitiser
 N = 40
+NOISY = load_recipe("published", ["training.noise=baselines", "generator.width=2"])
+DECAY = torch.exp(-(torch.arange(800) - 400).clamp(min=0) / 1800)
+RMS_KEV = 6.0
 
 
 def charge(n: int, seed: int) -> np.ndarray:
@@ -169,11 +172,6 @@ def test_the_inverse_gives_the_charge_back(ren, iren, sim) -> None:
     # prepared as simulated pulses are
     assert np.abs(back.min(axis=1)).max() < 1e-6
     np.testing.assert_allclose(back.max(axis=1), 1, atol=1e-6)
-
-
-NOISY = load_recipe("published", ["training.noise=baselines", "generator.width=2"])
-DECAY = torch.exp(-(torch.arange(800) - 400).clamp(min=0) / 1800)
-RMS_KEV = 6.0
 
 
 @pytest.fixture(scope="module")

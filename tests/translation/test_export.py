@@ -26,6 +26,8 @@ from cpunet.translation.export import chain_model, export_onnx
 from cpunet.translation.translator import IREN, REN
 from synthetic import load_recipe, waveform_table, write_chain
 
+MODULE = "cpunet.translation.dspeed_processor"
+
 
 def fitted(chain: ResponseGenerator) -> None:
     """Elsewhere than where a fit begins."""
@@ -142,9 +144,6 @@ def test_without_onnx_or_with_another_graph_nothing_is_left(chain, tmp_path, mon
     with pytest.raises(CpunetError, match=r"pip install 'cpunet-hpge\[onnx\]'"):
         export_onnx(chain, tmp_path / "ren.onnx")
     assert not list(tmp_path.iterdir())
-
-
-MODULE = "cpunet.translation.dspeed_processor"
 
 
 def table(waveforms: np.ndarray, energy: np.ndarray, dt_ns: float = 16.0) -> Table:

@@ -39,6 +39,7 @@ DATA = {
     }
 }
 ADC = Adc(length=1400, n_pre=700)
+PILED = ("n_piled", "piled_kev", "piled_ns")
 
 
 def charge(n=N, seed=1):
@@ -404,9 +405,6 @@ def test_tails_lift_the_baselines_of_raw_traces(busy):
     wanted = left * 0.9 * 26145.11 / 2614.511
     begin = (lifted.waveforms - none.waveforms)[:, :300].mean(axis=1)
     assert begin == pytest.approx(wanted * np.exp(-2.4 / 50), abs=25)
-
-
-PILED = ("n_piled", "piled_kev", "piled_ns")
 
 
 def test_piled_up_pulses_are_within_raw_traces_and_told(busy):

@@ -12,6 +12,9 @@ from cpunet.validation.figures import ae_energy_figure, roc_figure
 
 SEP_MEAN = -1.0  # in widths of the DEP, whose cut at 90 % lies at -1.28
 SEP_SURVIVAL = 100 * ndtr(SEP_MEAN - ndtri(0.1))
+LINES = {"DEP": (1587.5, 1597.5), "SEP": (2098.5, 2108.5), "FEP": (2609.5, 2619.5)}
+SCALE, SLOPE = 0.08, -1.5e-6  # per keV
+WIDTH, NOISE_KEV = 0.004, 6.0
 
 
 def peaks(rng, n_dep=800, n_sep=1000, scale=1.0):
@@ -188,11 +191,6 @@ def test_curves_of_survival_are_the_analytic_ones():
     for line in axes.lines:
         accepted, left = line.get_data()
         assert left == pytest.approx(np.clip(2 * accepted - 100, 0, 100) / 2, abs=0.2)
-
-
-LINES = {"DEP": (1587.5, 1597.5), "SEP": (2098.5, 2108.5), "FEP": (2609.5, 2619.5)}
-SCALE, SLOPE = 0.08, -1.5e-6  # per keV
-WIDTH, NOISE_KEV = 0.004, 6.0
 
 
 def events(

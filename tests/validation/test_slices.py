@@ -17,6 +17,7 @@ from cpunet.validation.peaks import around_half, sliced
 from synthetic import paired_scores, require_drawn
 
 DT = 16.0
+TIME = np.arange(800.0)
 
 
 def pulses(rng, n, width=5.0, noise=0.002):
@@ -57,9 +58,6 @@ def test_nothing_in_a_slice_is_no_failure():
     assert all(pulse.n == 0 for pulse in means["raw"][1:])
     columns = {str(i): {m: of[i] for m, of in means.items()} for i in (1, 2)}
     require_drawn(shape_figure(columns, DT, "SEP"))
-
-
-TIME = np.arange(800.0)
 
 
 def edge(time: np.ndarray, sigma: float) -> np.ndarray:

@@ -50,6 +50,9 @@ if words[0] in ("train", "validate"):
 elif words[0] != "demo":
     out.write_text("pulses")
 """
+ALL = ("-c2", "--show-failed-logs")
+DETECTORS = ("V99000A", "B99000A")
+ORIGIN_M = {"V99000A": (0.1, 0.0, -0.2), "B99000A": (0.0, -0.1, 0.3)}
 
 
 @dataclass(frozen=True)
@@ -369,11 +372,6 @@ def test_files_that_do_not_belong_together_are_one_line(tmp_path):
     (line,) = done.stderr.splitlines()
     assert line.startswith(f"error: {tmp_path / 'b.lh5'}: ")
     assert not (tmp_path / "out.lh5").exists()
-
-
-ALL = ("-c2", "--show-failed-logs")
-DETECTORS = ("V99000A", "B99000A")
-ORIGIN_M = {"V99000A": (0.1, 0.0, -0.2), "B99000A": (0.0, -0.1, 0.3)}
 
 
 def write_steps(path: Path, sims: dict[str, Path], events: slice) -> dict[str, Any]:
