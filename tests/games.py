@@ -6,21 +6,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.networks.positional_unet import GruDiscriminator
 from cpunet.recipes.schema import Recipe
 from cpunet.training.adversarial import Game
 from cpunet.training.network_runs import generators
 from cpunet.training.views import Side, Sides
-from synthetic import (
-    NOISE_BINS,
-    NOISE_SAMPLES,
-    decay,
-    edges,
-    load_recipe,
-    of_parts,
-    small_sides,
-)
+from synthetic import decay, edges, load_recipe, of_parts, small_sides, white_noise
 
 # 64-sample pulses and the narrowest networks: an iteration takes milliseconds.
 TINY = of_parts("""
@@ -49,11 +40,6 @@ def mended(*overrides: str) -> Recipe:
     return load_recipe("paper", [*SMALL, *overrides])
 
 
-def white(rms_kev: float = RMS_KEV) -> BaselineNoise:
-    density = np.full(NOISE_BINS, rms_kev**2)
-    return BaselineNoise(density, NOISE_SAMPLES, 16.0, 100)
-
-
 def windows(n: int = 12) -> tuple[torch.Tensor, torch.Tensor]:
     """Simulated windows of 800 samples, and their like behind a decay, with noise."""
     rng = np.random.default_rng(3)
@@ -70,7 +56,7 @@ def game_of(recipe: Recipe, n: int = 12) -> Game:
     pair = map(torch.from_numpy, small_sides()) if published else windows(n)
     seen = 1 - recipe.training.held_out
     sim, data = (Side(x, np.full(len(x), KEV), round(seen * len(x))) for x in pair)
-    noise = None if recipe.training.noise == "none" else white()
+    noise = None if recipe.training.noise == "none" else white_noise(RMS_KEV)
     made = generators(recipe, decay=1 / 1800)
     sides = Sides(sim, data, recipe.preparation, noise, not published)
     return Game(made["ren"], made["iren"], sides, recipe.cyclegan)

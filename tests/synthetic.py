@@ -298,6 +298,12 @@ def same_random_numbers() -> Iterator[None]:
         yield
 
 
+def white_noise(rms_kev: float) -> BaselineNoise:
+    """Noise without a colour."""
+    density = np.full(NOISE_BINS, rms_kev**2)
+    return BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100)
+
+
 def paired_scores(translated: FloatArray, truth: FloatArray, edge_samples: int) -> PairedScores:
     """Differences from the truth as a validation computes them."""
     return scores_of_squares(pair_squares({"ren": translated}, truth, edge_samples)["ren"])
@@ -324,8 +330,7 @@ def write_chain(
     dt_ns = facts.get("dt_ns", DT_NS)
     chain = ResponseGenerator(recipe.matching.generator, dt_ns)
     if noise_kev:
-        density = np.full(NOISE_BINS, noise_kev**2)
-        chain.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))
+        chain.set_noise(white_noise(noise_kev))
     change(chain)
     networks = {"ren": chain} | ({} if inverse is None else {"iren": inverse(chain)})
     folder.mkdir(exist_ok=True)

@@ -19,6 +19,7 @@ from synthetic import (
     drifting,
     load_recipe,
     two_sites,
+    white_noise,
 )
 from unpaired import crossing
 
@@ -48,19 +49,17 @@ def as_simulated(windows: FloatArray) -> FloatArray:
 
 def readout(noise_kev: float) -> ResponseGenerator:
     generator = ResponseGenerator(RECIPE.matching.generator, DT_NS)
-    density = np.full(NOISE_BINS, noise_kev**2)
-    generator.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))
+    generator.set_noise(white_noise(noise_kev))
     return generator
 
 
 def ren(generator: ResponseGenerator, sim: FloatArray, kev: float | None) -> FloatArray:
     """Windows as the data's, with the noise of an energy or none."""
+    how = (
+        {} if kev is None else {"noise": generator.noise, "energy_kev": np.full(len(sim), kev)}
+    )
     records = generator(sim)
-    noise = None if kev is None else generator.noise
-    energy = None if kev is None else np.full(len(sim), kev)
-    windows = finish(
-        records, RECIPE.preparation, dt_ns=DT_NS, noise=noise, energy_kev=energy, seed=5
-    ).windows
+    windows = finish(records, RECIPE.preparation, dt_ns=DT_NS, seed=5, **how).windows
     assert np.isfinite(windows).all()
     return windows
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 import torch
 
-from cpunet.electronics.baseline_noise import BaselineNoise
 from cpunet.electronics.drawn_pile_up import DrawnTails, InTracePileUp
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import KeptNoise
@@ -21,13 +20,12 @@ from cpunet.translation.translator import IREN, REN
 from games import untrained
 from synthetic import (
     FACTS,
-    NOISE_BINS,
-    NOISE_SAMPLES,
     after_pole_and_decay,
     in_traces,
     load_recipe,
     sampled,
     two_sites,
+    white_noise,
     write_chain,
     write_run,
 )
@@ -177,9 +175,8 @@ def test_the_inverse_gives_the_charge_back(ren, iren, sim) -> None:
 @pytest.fixture(scope="module")
 def noisy_run(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A network that was not trained."""
-    noise = BaselineNoise(np.full(NOISE_BINS, RMS_KEV**2), NOISE_SAMPLES, DT_NS, 100)
     kept = KeptNoise(DT_NS)
-    kept.set_noise(noise)
+    kept.set_noise(white_noise(RMS_KEV))
     torch.manual_seed(0)
     folder = tmp_path_factory.mktemp("run")
     drawn = DrawnTails(2.0, 50.0, (100.0, 2000.0), 1.0, 0.0, DT_NS)

@@ -31,13 +31,11 @@ from synthetic import edges, load_recipe, nearly_full_disk, write_chain, write_t
 DT_NS, N = 16.0, 40
 NOISE_KEV = 2.0
 # the data of a run: 1 in prepared units was 26145.11 ADC at 2614.511 keV
-DATA = {
-    "cuts": {
-        "amplitude": 26145.11,
-        "noise": 9.0,
-        "windows": [{"name": "baseline", "centre": 14000.0, "low": 0, "high": 1}],
-    }
-}
+BASELINE = {"name": "baseline", "centre": 14000.0, "low": 0, "high": 1}
+DATA = {"cuts": {"amplitude": 26145.11, "noise": 9.0, "windows": [BASELINE]}}
+DRAWN = {"rate_khz": 1.0, "decay_us": 50.0, "energies_kev": [100.0, 2000.0], "height": 0.9}
+DRAWN |= {"lead_us": 0.0, "dt_ns": DT_NS, "passed": [float(kev < 30) for kev in SIZES_KEV]}
+TAILS = {"rate_khz": 1.0, "drawn": DRAWN}
 ADC = Adc(length=1400, n_pre=700)
 PILED = ("n_piled", "piled_kev", "piled_ns")
 
@@ -45,20 +43,6 @@ PILED = ("n_piled", "piled_kev", "piled_ns")
 def charge(n=N, seed=1):
     """Edges of random width that end at 1."""
     return edges(n, seed, at=80).astype(np.float32)
-
-
-TAILS = {
-    "rate_khz": 1.0,
-    "drawn": {
-        "rate_khz": 1.0,
-        "decay_us": 50.0,
-        "energies_kev": [100.0, 2000.0],
-        "height": 0.9,
-        "lead_us": 0.0,
-        "dt_ns": DT_NS,
-        "passed": [float(kev < 30) for kev in SIZES_KEV],
-    },
-}
 
 
 @pytest.fixture(scope="module")
