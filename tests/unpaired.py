@@ -80,20 +80,16 @@ def faster(fine: Pulses, factor: float) -> Pulses:
     """The same charge, collected in a time shorter by this factor."""
     samples = np.arange(fine.waveforms.shape[1])
     end = (fine.waveforms >= 0.999).argmax(axis=1)
-    values = [
-        np.interp(at + factor * (samples - at), samples, row)
-        for at, row in zip(end, fine.waveforms, strict=True)
-    ]
+    rows = zip(end, fine.waveforms, strict=True)
+    values = [np.interp(at + factor * (samples - at), samples, row) for at, row in rows]
     return fine.with_waveforms(np.array(values, np.float32))
 
 
 def edge_errors(response: ElectronicsResponse) -> np.ndarray:
     """RMSE on the edge of other pulses than were fitted, against those of the true chain."""
     fine, frame = charge(200, seed=9), Frame(RECIPE.matching.training)
-    found, truth = (
-        read(np.asarray(records, float), frame).pulses
-        for records in (response(simulated(fine).waveforms), linear_response(fine, CHAIN))
-    )
+    both = response(simulated(fine).waveforms), linear_response(fine, CHAIN)
+    found, truth = (read(np.asarray(records, float), frame).pulses for records in both)
     edge = slice(frame.before - 100, frame.before + 30)
     level = RECIPE.preparation.tail_level  # of prepared pulses
     return np.asarray(level * np.sqrt(((found - truth)[:, edge] ** 2).mean(axis=1)))

@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 import cpunet
-from cpunet.cli import run
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.simulation.geometry_readers import read_detector
-from synthetic import load_recipe
+from synthetic import load_recipe, status_of
 
 # A readout of few numbers, and a chain that can describe it.
 READOUT = {
@@ -109,11 +108,8 @@ def test_it_is_a_run_like_any_other(calibrated, stand):
 def test_a_plan_is_told_before_any_fit(stand, tmp_path, capsys):
     out = tmp_path / "plan"
     words = ["--sim", stand / "sim.lh5", "--data", stand / "data.lh5", "--plan", "--out", out]
-    prior = ["--prior", "hole_velocity_low=1.2±0.06"]
-    assert (
-        run(["calibrate", *map(str, words), "--free", "temperature,hole_velocity_low", *prior])
-        == 0
-    )
+    words += ["--free", "temperature,hole_velocity_low", "--prior"]
+    assert status_of("calibrate", *words, "hole_velocity_low=1.2±0.06") == 0
     printed = capsys.readouterr().out
     assert "temperature [K]" in printed
     assert "in units of the prior" in printed

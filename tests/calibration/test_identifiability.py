@@ -41,12 +41,13 @@ def alike() -> Linear:
 def test_what_moves_pulses_alike_is_one_direction(alike):
     best, second, third = alike.directions([n.name for n in NUISANCES])
     assert best.error < 0.01
-    assert best.components["temperature_K"] == pytest.approx(0.7, abs=0.05)
-    assert best.components["hole_velocity_low_factor"] == pytest.approx(0.7, abs=0.05)
+    pairs = [
+        [one.components[name] for name in ("temperature_K", "hole_velocity_low_factor")]
+        for one in (best, second)
+    ]
+    assert pairs[0] == pytest.approx([0.7, 0.7], abs=0.05)
     assert second.error > 0.3
-    assert second.components["temperature_K"] * second.components[
-        "hole_velocity_low_factor"
-    ] == pytest.approx(-0.5, abs=0.05)
+    assert np.prod(pairs[1]) == pytest.approx(-0.5, abs=0.05)
     assert third.error == pytest.approx(1)
     assert third.components["cloud_fwhm_mm"] == pytest.approx(1)
     assert best.words.startswith("0.7")
@@ -83,12 +84,8 @@ def selection(seed=0, size=6.0, begun=0.0) -> Linear:
 
 def test_the_one_that_acts_describes_held_out_pulses_better():
     """On average by the fall of chi-square of all pulses, less the price of 2."""
-    gains = np.array(
-        [
-            [one.score([]) - one.score([i]) for i in range(4)]
-            for one in map(selection, range(200))
-        ]
-    )
+    problems = map(selection, range(200))
+    gains = np.array([[one.score([]) - one.score([i]) for i in range(4)] for one in problems])
     error = gains.std(axis=0) / np.sqrt(len(gains))
     expected = np.array([-2.0, -2.0, 36.0 - 2.0, -2.0])
     assert np.abs(gains.mean(axis=0) - expected) == pytest.approx(0, abs=0.1 * 36)
@@ -108,8 +105,7 @@ def test_costs_are_those_of_a_direct_fit():
 
 def test_what_is_told_begins_with_what_held_out_pulses_need():
     """Of two parameters that act alike, only the first taken is determined."""
-    nuisances = tuple(named(name) for name in ("temperature", "hole_velocity_low"))
-    widths = np.array([n.prior for n in nuisances])
+    widths = WIDTHS[:2]
     rng = np.random.default_rng(2)
     common, other = rng.normal(size=(2, ROWS))
     # alike, but the second one describes the pulses
@@ -170,12 +166,8 @@ def test_what_cannot_be_is_no_finding(values, name, why):
     doubts = {n: each.doubt for n, each in result.parameters.items() if each.doubt}
     assert [*doubts] == [name]
     assert why in doubts[name]
-    assert any(
-        note.startswith(f"the fit uses {name} = ")
-        and "to make up for something else" in note
-        and "`prior`" in note
-        for note in result.notes
-    )
+    begin, *parts = f"the fit uses {name} = ", "to make up for something else", "`prior`"
+    assert any(n.startswith(begin) and all(p in n for p in parts) for n in result.notes)
     assert not any("no other physics are needed" in note for note in result.notes)
     assert result.comment.startswith(f"# {name}: unreliable value, makes up for something")
     assert result.comment.count("\n") == 1
@@ -203,9 +195,8 @@ def estimate(rng: np.random.Generator) -> tuple[float, float, float, float]:
 
 
 def test_a_fit_without_sampling_noise_has_no_bias_and_errors_that_repeat():
-    plain, claimed, fitted, error = np.transpose(
-        [estimate(np.random.default_rng(seed)) for seed in range(200)]
-    )
+    experiments = [estimate(np.random.default_rng(seed)) for seed in range(200)]
+    plain, claimed, fitted, error = np.transpose(experiments)
     pulls = (fitted - TRUE) / error
     assert np.mean((plain - TRUE) / claimed) < -1
     assert abs(pulls.mean()) < 0.25
@@ -232,9 +223,7 @@ def test_what_pulses_do_not_determine_has_the_error_of_its_prior():
     priors = np.diag([1e-3, 1 / 0.7])
     deviations = rng.normal(size=(PARTS, FUNCTIONS))
     jacobian = np.concatenate([slopes.mean(axis=0), priors])
-    errors = [
-        np.sqrt(of_parts(jacobian, slopes, deviations, factor)[1].diagonal())
-        for factor in (1.0, 1.44)
-    ]
+    both = (of_parts(jacobian, slopes, deviations, factor)[1] for factor in (1.0, 1.44))
+    errors = [np.sqrt(covariance.diagonal()) for covariance in both]
     np.testing.assert_allclose([one[1] for one in errors], 0.7, rtol=1e-9)
     assert errors[1][0] == pytest.approx(1.2 * errors[0][0], rel=1e-3)

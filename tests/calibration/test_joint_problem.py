@@ -28,9 +28,8 @@ from synthetic import load_recipe
 from unpaired import CHAIN, DT_NS, charge, coarse, faster, measured_with
 
 RECIPE = load_recipe("fast")
-PHYSICS = Physics(
-    read_detector("ppc"), SimulationSettings(), (named("temperature"), named("impurity"))
-)
+FREE = tuple(named(name) for name in ("temperature", "impurity", "self_repulsion"))
+PHYSICS = Physics(read_detector("ppc"), SimulationSettings(), FREE[:2])
 N = 1200
 
 
@@ -93,9 +92,8 @@ def test_chi_square_is_that_of_the_definition(problem, functions):
     deviation = np.mean(simulated, axis=(0, 1)) - functions.data.mean(axis=0)
     expected = deviation @ np.linalg.solve(shrunk, deviation)
     assert both.compared()[0] == pytest.approx(expected, rel=1e-4)
-    assert both.compared()[1] == pytest.approx(
-        deviation / np.sqrt(covariance.diagonal()), abs=1e-3
-    )
+    pulls = deviation / np.sqrt(covariance.diagonal())
+    assert both.compared()[1] == pytest.approx(pulls, abs=1e-3)
     assert both.moments == sum(functions.groups.values()) == len(deviation)
 
 
@@ -140,9 +138,8 @@ def test_what_else_is_known_makes_errors_smaller(problem):
     before, after = linear(problem(few=True)), linear(known)
     own = before.errors([1])[0]
     assert after.errors([1])[0] == pytest.approx((own**-2 + 500**2) ** -0.5, rel=1e-6)
-    assert after.errors(pairs=1e-9) == pytest.approx(
-        [3.0, (0.1**-2 + 500**2) ** -0.5], rel=1e-4
-    )
+    errors = 3.0, (0.1**-2 + 500**2) ** -0.5
+    assert after.errors(pairs=1e-9) == pytest.approx(errors, rel=1e-4)
     np.testing.assert_allclose(after.information(), before.information(), rtol=1e-4)
 
 
@@ -224,9 +221,8 @@ def test_slices_multiply_components_and_amplitudes(functions):
     """All slices are numbers of the drift time times what is sliced."""
     second, third = values_of(functions, "components")[:, [-2, -3]].T
     slices = values_of(functions, "components in slices").reshape(len(second), OTHERS, -1)
-    np.testing.assert_allclose(
-        slices[:, 0] * third[:, None], slices[:, 1] * second[:, None], atol=1e-9
-    )
+    both = slices[:, 0] * third[:, None], slices[:, 1] * second[:, None]
+    np.testing.assert_allclose(*both, atol=1e-9)
     some = np.abs(second) > 0.1
     shares = slices[some, 0] / second[some, None]
     amplitude = values_of(functions, "current amplitude in slices")
@@ -248,9 +244,6 @@ def test_wider_functions_see_pulses_far_from_the_data(functions):
     assert far.max() > 1e-2
 
 
-FREE = [named(name) for name in ("temperature", "impurity", "self_repulsion")]
-
-
 @pytest.fixture(scope="module")
 def simulator(tmp_path_factory):
     detector = read_detector("ppc", ["grid_mm=0.5"])
@@ -259,7 +252,7 @@ def simulator(tmp_path_factory):
     hits = Hits.of(place, rng.uniform(200, 1000, 30), np.arange(0, 31, 3))
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("CPUNET_CACHE", str(tmp_path_factory.mktemp("cache")))
-        yield Simulator(hits, Physics(detector, SimulationSettings(dt_ns=4), tuple(FREE)))
+        yield Simulator(hits, Physics(detector, SimulationSettings(dt_ns=4), FREE))
 
 
 def laid_over(pulses, others):
@@ -289,10 +282,8 @@ def test_derivatives_follow_the_edge(simulator):
     late = nearby.half - nearby.derivatives[2].half
     assert late.max() > 0.3  # samples
     far = np.argmax(late)
-    followed, stale = (
-        np.linalg.norm(slopes[far] - fresh.slopes[2][far])
-        for slopes in (nearby.slopes[2], nearby.derivatives[2].pulses)
-    )
+    both = nearby.slopes[2], nearby.derivatives[2].pulses
+    followed, stale = (np.linalg.norm(of[far] - fresh.slopes[2][far]) for of in both)
     assert followed < 0.5 * stale
 
 

@@ -78,11 +78,9 @@ def test_a_parameter_that_explains_the_pulses_better_takes_the_place_of_another(
 def test_a_detector_that_does_not_deplete_within_the_priors_is_refused(bias, given):
     detector = read_detector("ppc", ["grid_mm=0.25"])
     depletes = solve(detector).depletion(detector.impurity_scale)
-    physics = Physics(
-        detector.model_copy(update={"bias_V": bias * depletes}),
-        SimulationSettings(),
-        (named("temperature"), named("impurity")),
-    )
+    biased = detector.model_copy(update={"bias_V": bias * depletes})
+    free = named("temperature"), named("impurity")
+    physics = Physics(biased, SimulationSettings(), free)
     refusal = r"within the priors it depletes at .* its bias is .*;"
     with pytest.raises(CpunetError, match=refusal):
         depletion(replace(physics, given=given))

@@ -72,9 +72,8 @@ def test_noise_has_the_variance_and_correlation_of_the_baselines(noise) -> None:
 
 
 def test_the_error_of_the_rms_covers_the_truth() -> None:
-    found = [
-        BaselineNoise.of(Baselines.of([traces(100, seed)], CONFIG)) for seed in range(20, 40)
-    ]
+    sets = (traces(100, seed) for seed in range(20, 40))
+    found = [BaselineNoise.of(Baselines.of([raw], CONFIG)) for raw in sets]
     errors = np.array([noise.rms_error for noise in found])
     pulls = (np.array([noise.rms for noise in found]) - WANTED) / errors
     assert np.median(errors) < 0.03 * WANTED
@@ -165,10 +164,8 @@ def test_noise_has_the_power_of_baselines_of_which_some_are_quiet() -> None:
     baselines[: n // 20] *= 0.3
     noise = BaselineNoise.of(Baselines.of([on_baselines(baselines)], CONFIG))
     assert noise.n_baselines > 0.98 * n
-    power = [
-        noise.draw(np.ones(n), used, np.random.default_rng(seed)).var(axis=1).mean()
-        for seed in range(5)
-    ]
+    drawn = (noise.draw(np.ones(n), used, np.random.default_rng(seed)) for seed in range(5))
+    power = [of.var(axis=1).mean() for of in drawn]
     ratios = np.array(power) / TO_PREPARED**2 / baselines[:, :used].var(axis=1).mean()
     assert ratios == pytest.approx(1, abs=0.02)
 

@@ -26,10 +26,8 @@ from cpunet.simulation.simulate import StoredSimulation
 from cpunet.simulation.simulator import Simulator
 from synthetic import load_recipe, prepared_truth
 
-SMALL_CRYSTAL = (
-    "crystal_length=14 crystal_radius=10 bottom_taper_length=2 bias_V=600 grid_mm=0.25"
-)
-DETECTOR = read_detector("ppc", ["name=small", *SMALL_CRYSTAL.split()])
+SMALL_CRYSTAL = "crystal_length=14 crystal_radius=10 bottom_taper_length=2 bias_V=600"
+DETECTOR = read_detector("ppc", ["name=small", *SMALL_CRYSTAL.split(), "grid_mm=0.25"])
 EVENTS = {"FEP": 10, "1000-2000": 30}
 SMALL = {"electronics": "ornl", "detector": DETECTOR, "events": EVENTS}
 FILES = (".cpunet.json", "data.lh5", "data_labels.npz", "sim.lh5", "stand.json", "truth.npz")

@@ -88,10 +88,9 @@ def test_currents_about_their_maximum() -> None:
             expected = np.convolve(expected, np.ones(48) / 48)
         assert abs(time - expected.argmax()) <= 0.5
         at = time + np.arange(-300, 301)
+        near = np.interp(at, np.arange(len(expected)), expected)
         np.testing.assert_allclose(
-            current[PEAK - 300 : PEAK + 301],
-            np.interp(at, np.arange(len(expected)), expected),
-            atol=2e-3 * expected.max(),
+            current[PEAK - 300 : PEAK + 301], near, atol=2e-3 * near.max()
         )
         assert current.argmax() == PEAK
     # moved by a fraction of a sample, the current is the same
@@ -240,10 +239,8 @@ def test_single_places_within_are_filled(chain: Path, current: Path, tmp_path: P
     source = write(tmp_path / "ideal.lh5", without(charge(), np.s_[2, 3]))
     told = translate_library(chain, source, tmp_path / "psl.lh5").numbers
     assert told["V01"].healed == 2
-    times, known = (
-        lh5.read("V01/drift_time_000_deg", str(path)).nda
-        for path in (tmp_path / "psl.lh5", current)
-    )
+    files = tmp_path / "psl.lh5", current
+    times, known = (lh5.read("V01/drift_time_000_deg", str(path)).nda for path in files)
     assert times[2, 6] == pytest.approx(known[2, 6], abs=20)  # of 60 from node to node
 
 

@@ -16,10 +16,8 @@ from cpunet.errors import CpunetError
 from cpunet.legend.export import equivalent_kernel, export_legend, kernel_step
 from synthetic import write_chain
 
-MEAN = {
-    **{"a": -1.5e-6, "b": 1.0024, "a_error": 2e-7, "chi_square": 3.0, "degrees": 4},
-    **{"per_mev_percent": -0.15, "per_mev_error_percent": 0.02},
-}
+MEAN = {"a": -1.5e-6, "b": 1.0024, "a_error": 2e-7, "chi_square": 3.0, "degrees": 4}
+MEAN |= {"per_mev_percent": -0.15, "per_mev_error_percent": 0.02}
 LAW = {"a": 2e-5, "b": 6.0, "c": 2.0}
 WIDTH = LAW | {"at_reference_percent": 0.6}
 METHOD = {"mean": MEAN, "resolution": WIDTH, "points": [], "scale": 0.08, "scale_error": 0.01}
@@ -60,9 +58,8 @@ def test_files_of_production(chain: Path, tmp_path: Path) -> None:
     assert 10 < electronics["sigma"] < 40 < electronics["tau"] < 90
     # the expressions are evaluated by production with x in keV
     mean = read(out / "aoemeanmod.yaml")["V01"]["psl"]
-    assert eval(mean["expression"], {}, {"x": 1592.5} | mean["pars"]) == pytest.approx(
-        1, abs=1e-4
-    )
+    value = eval(mean["expression"], {}, {"x": 1592.5} | mean["pars"])
+    assert value == pytest.approx(1, abs=1e-4)
     width = read(out / "aoeresmod.yaml")["V01"]
     assert width == {"expression": "SigmaFit", "parameters": LAW}
     whole = read(out / "cpunet.yaml")

@@ -19,11 +19,8 @@ from synthetic import load_recipe, prepared_of
 
 CUTS = CutConfig(decay_sigmas=6.0, chi2_sigmas=6.0, baseline_sigmas=6.0)
 Array = npt.NDArray[np.float64]
-LINES = {
-    "FEP": PeakConfig(energy_kev=2614.511, half_width_kev=5),
-    "SEP": PeakConfig(energy_kev=2103.511, half_width_kev=5),
-    "DEP": PeakConfig(energy_kev=1592.511, half_width_kev=5),
-}
+KEV = {"FEP": 2614.511, "SEP": 2103.511, "DEP": 1592.511}
+LINES = {name: PeakConfig(energy_kev=kev, half_width_kev=5) for name, kev in KEV.items()}
 
 lines = st.dictionaries(
     st.sampled_from("ABCDE"),

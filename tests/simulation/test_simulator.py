@@ -21,9 +21,8 @@ from cpunet.simulation.settings import SimulationSettings
 from cpunet.simulation.simulator import Simulator, merge_hits
 
 PLAIN = SimulationSettings(dt_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0)
-SIGGEN = PLAIN.model_copy(
-    update={"diffusion": True, "diffusion_constant": "siggen", "cloud_fwhm_mm": 0.1}
-)
+CLOUDS = {"diffusion": True, "diffusion_constant": "siggen", "cloud_fwhm_mm": 0.1}
+SIGGEN = PLAIN.model_copy(update=CLOUDS)
 
 
 ICPC = read_detector("icpc")  # at 90 K, as the reference pulses
@@ -158,9 +157,8 @@ def test_an_event_is_the_weighted_sum_of_its_hits(planar: FieldMaps) -> None:
     simulator = of(planar, SimulationSettings(length_ns=2400))
     events = simulator.events(hits)
     single = simulator.signals(*np.transpose(place), 1.0).waveforms
-    np.testing.assert_allclose(
-        events.waveforms[0], 0.75 * single[0] + 0.25 * single[1], atol=1e-6
-    )
+    both = 0.75 * single[0] + 0.25 * single[1]
+    np.testing.assert_allclose(events.waveforms[0], both, atol=1e-6)
     assert events.lost_kev.tolist() == [50.0, 0.0]
     assert events.collected_kev.tolist() == [400.0, 0.0]
     assert events.valid.tolist() == events.collected.tolist() == [True, True, False]
@@ -208,10 +206,8 @@ def test_holes_slide_along_the_ditch_and_are_not_collected_there() -> None:
     ids=lambda values: str(next(iter(values))),
 )
 def test_quick_differences_are_the_exact_ones(values: dict[str, float]) -> None:
-    detector, settings = (
-        read_detector("ppc", ["grid_mm=0.5"]),
-        SimulationSettings(length_ns=1600),
-    )
+    detector = read_detector("ppc", ["grid_mm=0.5"])
+    settings = SimulationSettings(length_ns=1600)
     rng = np.random.default_rng(1)
     size, length = detector.crystal_radius / 1.4, detector.crystal_length
     place = rng.uniform([-size, -size, 0], [size, size, length], (120, 3))
@@ -340,9 +336,8 @@ def test_factors_hold_below_and_above_and_change_smoothly_in_between() -> None:
             ratio = drift_velocity(scaled, field, HOLE) @ direction
             ratio = ratio / (drift_velocity(own, field, HOLE) @ direction)
             assert ratio == pytest.approx(factor, rel=1e-9)
-            np.testing.assert_array_equal(
-                drift_velocity(scaled, field, ELECTRON), drift_velocity(own, field, ELECTRON)
-            )
+            electrons = (drift_velocity(table, field, ELECTRON) for table in (scaled, own))
+            np.testing.assert_array_equal(*electrons)
     ratio = scaled[0][HOLE, 1:, V100] / own[0][HOLE, 1:, V100]  # at equidistant fields
     assert np.diff(ratio).min() >= -1e-12
     assert np.abs(np.diff(ratio)).max() < 0.1

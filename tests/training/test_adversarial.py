@@ -148,17 +148,15 @@ def test_the_losses():
 @pytest.mark.parametrize("recipe", [mended, as_published])
 @pytest.mark.parametrize("part", ["ren", "iren"])
 def test_the_adversarial_loss_alone_reaches_every_parameter_of_a_generator(recipe, part):
-    overrides = (
-        () if recipe is mended else ("discriminator.value_range=[-10, 10]", "generator.width=4")
-    )
+    wide = "discriminator.value_range=[-10, 10]", "generator.width=4"
+    overrides = () if recipe is mended else wide
     game = game_of(recipe(*overrides))
     for network in game.generators.values():
         if hasattr(network.unet, "unet"):  # its last layer is zero
             nn.init.normal_(network.unet.unet.outlet.weight)
     sim, data = (side.pulses[:4] for side in game.sides[:2])
-    side, real, fake = (
-        ("data", data, game.ren(sim)) if part == "ren" else ("sim", sim, game.iren(data))
-    )
+    both = {"ren": ("data", data, game.ren(sim)), "iren": ("sim", sim, game.iren(data))}
+    side, real, fake = both[part]
     game.play(side, part, real, fake)[f"adversarial_{part}"].backward()
     own = game.generators[part]
     still = [n for n, p in own.named_parameters() if p.grad is None or not p.grad.any()]
@@ -172,15 +170,10 @@ def test_every_part_of_a_game_moves(recipe):
     losses = game.step()
     assert set(losses) == set(LOSS_NAMES)
     for old, new in zip(before, [game.generators, game.critics], strict=True):
-        still = [
-            name
-            for (name, a), b in zip(old.named_parameters(), new.parameters(), strict=True)
-            if torch.equal(a, b)
-        ]
+        pairs = zip(old.named_parameters(), new.parameters(), strict=True)
+        still = [name for (name, a), b in pairs if torch.equal(a, b)]
         # nothing moves behind a last layer that is zero, and a pair has no common offset
-        assert [
-            n for n in still if "unet.unet" not in n and not n.endswith("outlet.bias")
-        ] == []
+        assert not [n for n in still if "unet.unet" not in n and not n.endswith("outlet.bias")]
     game.step()
 
 
@@ -235,9 +228,8 @@ def test_what_is_not_finite_ends_a_training_and_is_not_kept(monkeypatch, bad):
         losses = step(self)
         if self.iteration == 3 and bad == "weight":
             next(self.average.parameters())[:] = torch.nan
-        return losses | (
-            {"identity_sim": math.inf} if self.iteration == 3 and bad == "loss" else {}
-        )
+        infinite = {"identity_sim": math.inf} if self.iteration == 3 and bad == "loss" else {}
+        return losses | infinite
 
     monkeypatch.setattr(Game, "step", diverging)
     states, recipe = [], as_published("training.checkpoint_interval=1")
@@ -324,18 +316,16 @@ def test_statistics_are_those_of_a_side_without_dropout():
     network = nn.Sequential(nn.Dropout(0.5), nn.BatchNorm1d(64)).eval()
     config = as_published("training.batch_size=11", "training.statistics_batches=200").training
     settle(network, side, config)
-    torch.testing.assert_close(
-        network[1].running_mean, side.pulses.mean(dim=0), atol=0.02, rtol=0
-    )
+    mean = side.pulses.mean(dim=0)
+    torch.testing.assert_close(network[1].running_mean, mean, atol=0.02, rtol=0)
     assert network[0].p == 0.5
 
 
 @pytest.mark.slow
 def test_a_step_response_is_learned_from_unpaired_pulses():
     """REN begins 0.04 RMS off on the edge, by its poles."""
-    recipe = load_recipe(
-        "paper", ["training.iterations=250", "training.held_out=0.1", "discriminator.hidden=32"]
-    )
+    few = "training.iterations=250", "training.held_out=0.1", "discriminator.hidden=32"
+    recipe = load_recipe("paper", few)
     game = train(partial(game_of, recipe, n=1500), 0)
     ren, (sim, data) = game.average["ren"], (side.pulses for side in game.sides[:2])
     with torch.no_grad():

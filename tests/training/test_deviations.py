@@ -26,9 +26,8 @@ RINGS = type(CHAIN).model_validate(CHAIN.model_dump() | {"ringing": RINGING})
 
 def true_response(poles_ns: tuple[float, float] = (55.0, 35.0)) -> ElectronicsResponse:
     """The chain that the data went through."""
-    config = RECIPE.generator.model_copy(
-        update={"poles_ns": poles_ns, "decay_us": CHAIN.decays[0].tau_us}
-    )
+    known = {"poles_ns": poles_ns, "decay_us": CHAIN.decays[0].tau_us}
+    config = RECIPE.generator.model_copy(update=known)
     response = ElectronicsResponse(config, DT_NS)
     response.slow_weights.fill(0.065)
     return response
@@ -123,9 +122,8 @@ def test_what_a_verdict_says():
     wrong = {"z": 30.0, "beyond_ns": [300.0, 820.0], "off": {"top": 30.0, "onset": 9.0}}
     bad = Verdict.model_validate(right | wrong)
     assert not bad.good
-    assert "is off by 30.0 standard errors, from 300 to 820 ns after the half height" in str(
-        bad
-    )
+    said = "is off by 30.0 standard errors, from 300 to 820 ns after the half height"
+    assert said in str(bad)
     assert bad.causes[0] == f"the onset is off by 9.0 standard errors: {PARTS['onset'][1]}"
     seen = Verdict.model_validate(right | {"auc": 0.7, "auc_error": 0.02})
     assert not seen.good
@@ -143,9 +141,8 @@ def test_a_deviation_acts_at_its_lags_and_decays_with_the_chain():
     np.testing.assert_allclose(apart[lags[0] :], deviation[: -lags[0]], atol=1e-12)
     early, late = (round(ns / DT_NS) for ns in LATE_NS)
     rate = np.log(moved[late] / moved[early]) / (late - early)
-    np.testing.assert_allclose(
-        moved[last:4000], moved[last] * np.exp(rate * np.arange(4000 - last)), atol=1e-9
-    )
+    tail = moved[last] * np.exp(rate * np.arange(4000 - last))
+    np.testing.assert_allclose(moved[last:4000], tail, atol=1e-9)
     # records are those of its closed form, sampled as means over the period
     step = np.float32(np.arange(1600) >= 400)[np.newaxis]
     record = own(step)[0][padding(DT_NS)[0] + 400 :]

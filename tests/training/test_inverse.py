@@ -55,9 +55,7 @@ def readout(noise_kev: float) -> ResponseGenerator:
 
 def ren(generator: ResponseGenerator, sim: FloatArray, kev: float | None) -> FloatArray:
     """Windows as the data's, with the noise of an energy or none."""
-    how = (
-        {} if kev is None else {"noise": generator.noise, "energy_kev": np.full(len(sim), kev)}
-    )
+    how = {"noise": generator.noise, "energy_kev": np.full(len(sim), kev)} if kev else {}
     records = generator(sim)
     windows = finish(records, RECIPE.preparation, dt_ns=DT_NS, seed=5, **how).windows
     assert np.isfinite(windows).all()
@@ -131,9 +129,8 @@ def test_noise_is_taken_away_and_the_edge_is_restored(noisy, held_out, kev):
     assert rms(found[:, 320:] - 1) < 0.3 * NOISE_KEV / kev
     # right before the edge, where charge could have moved, less of it goes
     quiet = (truth == 0) & (np.arange(350) > 100)
-    before, after = (
-        np.median(np.sqrt((values**2).sum(axis=1, where=quiet))) for values in (measured, found)
-    )
+    squares = ((values**2).sum(axis=1, where=quiet) for values in (measured, found))
+    before, after = (np.median(np.sqrt(of)) for of in squares)
     assert after < 0.75 * before
     unit = measured / measured.max(axis=1, keepdims=True)
     assert np.median(error(found, truth)) < 0.15 * np.median(error(unit, truth))
@@ -146,10 +143,9 @@ def test_coloured_noise_is_known_for_what_it_is(held_out):
     generator.set_noise(BaselineNoise(density, NOISE_SAMPLES, DT_NS, 100))
     windows, truth = ren(generator, held_out, FEP_KEV), at_half(held_out)
     # of most pulses: noise at half the height may move the alignment of a few by far
-    right, mistaken = (
-        np.median(error(at_half(fitted(of)(windows)), truth))
-        for of in (generator, readout(generator.noise.rms))
-    )
+    readouts = generator, readout(generator.noise.rms)
+    found = (at_half(fitted(of)(windows)) for of in readouts)
+    right, mistaken = (np.median(error(pulses, truth)) for pulses in found)
     assert right < 0.85 * mistaken
 
 

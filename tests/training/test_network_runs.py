@@ -21,11 +21,7 @@ from synthetic import (
     write_line,
 )
 
-SHORT = (
-    "training.start_factors=[1]",
-    "generator.slow_ns=[]",
-    "generator.fast_decays_us=[]",
-)
+SHORT = ("training.start_factors=[1]", "generator.slow_ns=[]", "generator.fast_decays_us=[]")
 GAME = (
     "residual.generator.width=2",
     "residual.training.iterations=6",
@@ -107,7 +103,5 @@ def test_losses_and_accuracies_are_drawn(kept):
 
 @pytest.mark.parametrize(("gain", "scale"), [(-0.1, 0.0), (0.0, 0.0), (0.1, 0.0), (0.3, 0.5)])
 def test_what_gains_by_two_standard_errors_is_used(gain, scale):
-    assert network_runs._scale(1, gain, 0.1, "AUC") == (
-        scale,
-        f"{'used, scaled by 0.5' if scale else 'left out'}; AUC",
-    )
+    used = "used, scaled by 0.5" if scale else "left out"
+    assert network_runs._scale(1, gain, 0.1, "AUC") == (scale, f"{used}; AUC")

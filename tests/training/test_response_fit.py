@@ -296,9 +296,8 @@ def test_coordinates_are_those_of_poles_and_decays_and_back() -> None:
     np.testing.assert_allclose(smooth.turn().T, slopes, atol=1e-5)
     known = np.diag([1e4, 1e6, 1e4, 1e6, 1e2, 1e5, 1e5])
     by_parameters = np.array(slopes) @ known @ np.transpose(slopes)
-    covariance = np.linalg.inv(
-        by_parameters + np.diag(SmoothParameters(made, poles=False).widths ** -2.0)
-    )
+    priors = np.diag(SmoothParameters(made, poles=False).widths ** -2.0)
+    covariance = np.linalg.inv(by_parameters + priors)
     np.testing.assert_allclose(smooth.covariance(known), covariance, rtol=1e-4, atol=1e-9)
 
 

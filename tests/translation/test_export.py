@@ -80,14 +80,9 @@ def test_the_graph_of_a_chain_with_its_noise_and_origin(chain, sim, tmp_path):
     assert records.shape == (5, 1400)
     translator = REN.load(chain)
     # prepared as data, they are the translation
-    clean = prepare(
-        Pulses.of(records, dt_ns=16),
-        translator.recipe.preparation.model_copy(update={"saturation_run": 2000}),
-        "measured",
-    )
-    np.testing.assert_allclose(
-        clean.pulses.waveforms, translator.translate(sim, noise=False), atol=5e-5
-    )
+    preparation = translator.recipe.preparation.model_copy(update={"saturation_run": 2000})
+    clean = prepare(Pulses.of(records, dt_ns=16), preparation, "measured").pulses.waveforms
+    np.testing.assert_allclose(clean, translator.translate(sim, noise=False), atol=5e-5)
     assert done.noise.name == "ren.noise.npz"
     with np.load(done.noise) as noise:
         total = noise["shares"] @ (noise["continua"] + noise["lines"])
@@ -202,10 +197,8 @@ def test_noise_by_the_energy_of_each_event(chain, sim):
     energy = np.where(np.arange(40) < 20, 2000.0, 500.0)
     energy[3] = np.nan
     given = table(waveforms, energy)
-    made = [
-        build_dsp(raw_in=given, dsp_config=config(chain, "ren", ["energy"], *init))
-        for init in ((True, 3), (True, 3), (True, 4))
-    ]
+    configs = (config(chain, "ren", ["energy"], True, seed) for seed in (3, 3, 4))
+    made = [build_dsp(raw_in=given, dsp_config=of_seed) for of_seed in configs]
     first, again, other = (tb["wf_out"]["values"].nda for tb in made)
     assert np.isnan(first[3]).all()
     assert np.isfinite(np.delete(first, 3, axis=0)).all()
@@ -222,14 +215,10 @@ def test_a_network_both_ways(network, sim, data):
         (sim, "ren", False, REN.load(network)),
         (data, "iren", 7, IREN.load(network)),
     ):
-        made = build_dsp(
-            raw_in=table(given, np.ones(5)),
-            dsp_config=config(network, function, [], init),
-            block_width=5,
-        )
-        expected = translator.translate_pulses(
-            Pulses.of(given, dt_ns=16), noise=bool(init), generator=np.random.default_rng(7)
-        )
+        settings = config(network, function, [], init)
+        made = build_dsp(raw_in=table(given, np.ones(5)), dsp_config=settings, block_width=5)
+        pulses, how = Pulses.of(given, dt_ns=16), {"generator": np.random.default_rng(7)}
+        expected = translator.translate_pulses(pulses, noise=bool(init), **how)
         assert expected.valid.all()
         found = made["wf_out"]["values"].nda
         np.testing.assert_allclose(found, expected.pulses.waveforms, atol=1e-5)

@@ -296,9 +296,8 @@ def test_traces_in_adc_counts(run, tmp_path, adc):
     windows = REN.load(run).translate(charge(), noise=False)
     same = back.align_sample == n_pre
     assert same.sum() > N / 3
-    np.testing.assert_allclose(
-        back.pulses.waveforms[same], windows[back.index[same]], atol=1.2 / 5000
-    )
+    wanted = windows[back.index[same]]
+    np.testing.assert_allclose(back.pulses.waveforms[same], wanted, atol=1.2 / 5000)
 
 
 def test_noise_runs_all_along_a_chains_record_and_is_filled_in_for_a_network(
@@ -379,10 +378,8 @@ def test_learned_tails_are_those_behind_the_cuts(busy, tmp_path):
 
 
 def test_tails_lift_the_baselines_of_raw_traces(busy):
-    none, lifted = (
-        translate(busy, simulated(), adc=True, scale=ADC, tails=tails, seed=3)
-        for tails in ("none", "3")
-    )
+    how = {"adc": True, "scale": ADC, "seed": 3}
+    none, lifted = (translate(busy, simulated(), tails=tails, **how) for tails in ("none", "3"))
     (left,) = truth(lifted, "tails_kev")
     assert (left > 20).sum() > 5
     # 9 ADC per keV of height 0.9
@@ -392,10 +389,8 @@ def test_tails_lift_the_baselines_of_raw_traces(busy):
 
 
 def test_piled_up_pulses_are_within_raw_traces_and_told(busy):
-    none, some = (
-        translate(busy, simulated(5 * N), adc=True, scale=ADC, seed=3, pile_up_khz=rate)
-        for rate in (0, 20)
-    )
+    sim, how = simulated(5 * N), {"adc": True, "scale": ADC, "seed": 3}
+    none, some = (translate(busy, sim, pile_up_khz=rate, **how) for rate in (0, 20))
     assert not none.in_memory.truth
     count, kev, after_ns = truth(some, *PILED)
     assert 0 < (count > 0).sum() < 5 * N

@@ -148,9 +148,8 @@ def test_survival_of_a_line_is_that_of_its_own_events():
     amplitude[:10] = np.nan
     dep = np.linspace(0.7 - 0.01, 0.7 + 0.09, 2001)  # whose cut lies at 0.7
     bands = {"SEP": ((2098.5, 2108.5), [(2060, 2090), (2117, 2147)])}
-    table, ranges = survivals(
-        {"DEP": {"data": dep}}, {"data": amplitude}, {"data": energy}, bands
-    )
+    sets = {"DEP": {"data": dep}}, {"data": amplitude}, {"data": energy}
+    table, ranges = survivals(*sets, bands)
     of_line = ranges["SEP"]["data"]
     assert of_line.survival == table["SEP"].survival["data"] == pytest.approx(50, abs=1)
     assert of_line.scale == pytest.approx(10 / 60)
@@ -183,9 +182,8 @@ def test_curves_of_survival_are_the_analytic_ones():
     """Of uniform amplitudes a cut that leaves a part p of one leaves 2 p - 1 of the other."""
     single, other = np.linspace(1, 3, 2001), np.linspace(0, 2, 2001)
     unknown = np.append(other, np.nan)
-    drawn = roc_figure(
-        {"SEP": {"data": unknown, "ren": other}, "DEP": dict.fromkeys(("data", "ren"), single)}
-    )
+    both = dict.fromkeys(("data", "ren"), single)
+    drawn = roc_figure({"SEP": {"data": unknown, "ren": other}, "DEP": both})
     (axes,) = drawn.axes
     assert [line.get_label() for line in axes.lines] == ["Data", "REN translation"]
     for line in axes.lines:
@@ -216,9 +214,8 @@ def test_the_line_through_the_continuum() -> None:
     pulls, widths = [], []
     for seed in range(6):
         rng = np.random.default_rng(seed)
-        amplitude, energy = joined(
-            events(rng.uniform(950, 1750, 3000), 0.5, rng), line(1587.5, 500, 0.1, rng)
-        )
+        continuum = events(rng.uniform(950, 1750, 3000), 0.5, rng)
+        amplitude, energy = joined(continuum, line(1587.5, 500, 0.1, rng))
         found = against_energy({"data": amplitude}, {"data": energy}, LINES)
         assert not found.multi_site
         mean, law = found.methods["data"].mean, found.methods["data"].resolution
