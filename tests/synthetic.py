@@ -27,6 +27,7 @@ import pytest
 import scipy.signal
 from lgdo import LGDO, Array, ArrayOfEqualSizedArrays, Table, WaveformTable
 from matplotlib.figure import Figure
+from scipy.special import ndtr
 
 from cpunet import recipes
 from cpunet.cli import main
@@ -117,6 +118,11 @@ def edges(
     """Charge of logistic edges of random width, shape (n, length)."""
     width = np.random.default_rng(seed).uniform(*widths, (n, 1))
     return np.asarray(1 / (1 + np.exp(-(np.arange(length) - at) / width)))
+
+
+def gaussian_edge(time: Values, sigma: npt.ArrayLike) -> Values:
+    """A Gaussian edge at 0, as after bandwidth poles; exactly 0.5 at time 0."""
+    return np.asarray(ndtr(time / sigma))
 
 
 def phased_edges(n: int, rng: np.random.Generator, at: float, length: int) -> Values:
@@ -393,12 +399,11 @@ def status_of(*words: object) -> Any:
 
 PROGRAM = """
 {before}
-import sys
-from cpunet.cli import main
+import runpy, sys
 for words in sys.argv[1:]:
     sys.argv[1:] = words.split()
     try:
-        main()
+        runpy.run_module("cpunet", run_name="__main__")
     except SystemExit as end:
         if end.code:
             raise

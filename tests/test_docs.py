@@ -121,7 +121,6 @@ def test_the_yaml(page, code):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_the_links(page):
-    """Files that a page links to or shows are there, and so are the headings."""
     for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
         name, _, heading = target.partition("#")
         if "://" in target or name.startswith(MADE_BY_THE_SITE):

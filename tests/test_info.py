@@ -131,7 +131,6 @@ def test_files_of_hits_are_described(tmp_path):
 
 
 def test_the_properties_are_those_that_were_made():
-    """Noise and decay of traces made here."""
     rng, n, length, at = np.random.default_rng(4), 60, 1600, 700
     time = np.arange(length)
     shape = np.where(time < at, 0, np.exp(-(time - at) * 16e-3 / 50))
@@ -189,12 +188,9 @@ def test_the_noise_of_a_run_is_that_of_its_response(monkeypatch, tmp_path):
     assert dict(info(run).lines)["noise"] == "1.950 ± 0.050 keV (RMS), of 9 baselines"
 
 
-COARSE = {"grid_mm": 0.5}
-
-
 @pytest.mark.usefixtures("own_cache")
 def test_numbers_of_a_detector():
-    told = dict(info("ppc", settings=COARSE).lines)
+    told = dict(info("ppc", settings={"grid_mm": 0.5}).lines)
     # at 0.5 mm the contact is coarse; at 0.1 mm it is 2.10 pF and 1854 V
     assert 1.8 < float(told["capacitance"].split()[0]) < 2.4
     assert 1700 < float(told["depletion voltage"].split()[0]) < 2000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -19,6 +20,7 @@ from cpunet.outputs import (
 )
 
 RUN = FolderKind("run", "cpunet train", r"run\.json|log/[ab]")
+run_folder_aside = partial(folder_written_aside, kind=RUN, force=True)
 REPORT = FolderKind("report", "cpunet validate", r"metrics\.json")
 
 
@@ -37,10 +39,6 @@ def make(folder: Path, kind: FolderKind = RUN, **files: str) -> None:
             path = aside / name.replace("__", "/").replace("_", ".")
             path.parent.mkdir(exist_ok=True)
             path.write_text(text)
-
-
-def run_folder_aside(target: Path):
-    return folder_written_aside(target, RUN, force=True)
 
 
 @pytest.mark.parametrize("old", [None, "old"])

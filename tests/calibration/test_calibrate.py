@@ -11,19 +11,17 @@ import pytest
 import cpunet
 from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.simulation.geometry_readers import read_detector
-from synthetic import load_recipe, status_of
+from synthetic import load_recipe, of_parts, status_of
 
 # A readout of few numbers, and a chain that can describe it.
 READOUT = {
     "slow": {"fraction": 0.065, "tau_ns": 400.0},
     "decays": [{"fraction": 1.0, "tau_us": 80.0}],
 }
-PLAIN = (
-    "generator.slow_ns=[400]",
-    "generator.fast_decays_us=[]",
-    "training.start_factors=[1]",
-    "training.steps=5",
-)
+PLAIN = of_parts("""
+generator slow_ns=[400] fast_decays_us=[]
+training start_factors=[1] steps=5
+""")
 
 
 @pytest.fixture(scope="module")

@@ -28,9 +28,8 @@ def test_the_help_of_a_command_has_examples(command, name):
 
 
 def test_words_that_are_missing_or_unknown_are_named(command):
-    assert command("train", "--sim", "sim.lh5").err == (
-        "error: --data is missing; see cpunet train --help\n"
-    )
+    said = command("train", "--sim", "sim.lh5").err
+    assert said == "error: --data is missing; see cpunet train --help\n"
     assert command("trai").err.startswith('error: Unknown command "trai"')
 
 

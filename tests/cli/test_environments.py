@@ -53,9 +53,10 @@ def test_characters_that_a_terminal_lacks_are_replaced(stand, encoding):
     name = stand.folder / "caf\udce9.lh5"
     if not name.exists():
         os.link(stand.sim, name)
-    said = python("-m", "cpunet", "info", name, PYTHONIOENCODING=encoding)
-    assert f"{len(stand.sim_kev)} of 225 samples" in said
-    python("-m", "cpunet", "info", name / "\u03bc", PYTHONIOENCODING=encoding, status=2)
+    commands = f"info {name}", f"info {name}/\u03bc"
+    done = in_a_process(*commands, PYTHONIOENCODING=encoding)
+    assert f"{len(stand.sim_kev)} of 225 samples" in done.stdout
+    assert (done.returncode, done.stderr.count("error: ")) == (2, 1)
 
 
 def test_a_script_without_a_guard_is_named(stand, tmp_path):

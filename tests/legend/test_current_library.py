@@ -35,7 +35,7 @@ from cpunet.training.run import Run
 from cpunet.translation.translator import REN
 from synthetic import after_pole_and_decay, one_line, sampled, write_chain, write_pulses
 
-R, Z = np.arange(6.0), np.arange(8.0)
+R, Z, MM = np.arange(6.0), np.arange(8.0), {"units": "mm"}
 WAVEFORMS = ("waveform_000_deg", "waveform_045_deg")
 SETTINGS = SimulationSettings(dt_ns=1.0, length_ns=5000.0)
 FINE = 8  # samples of the charge to one of a template
@@ -177,16 +177,13 @@ def without(waveforms: np.ndarray, which: Any) -> np.ndarray:
         ({"dt": Scalar(2.0, attrs={"units": "ns"})}, "sampled every 2 ns (dt in 'ns')"),
         ({"dt": Scalar(1.0, attrs={"units": "furlong"})}, "dt in 'furlong'"),
         ({"dt": None}, "no dt with the waveforms"),
-        ({"z": Array(np.empty((0, 2)), attrs={"units": "mm"})}, "z does not ascend"),
+        ({"z": Array(np.empty((0, 2)), attrs=MM)}, "z does not ascend"),
         (dict.fromkeys(WAVEFORMS), "no pulse-shape library"),
         (dict.fromkeys(WAVEFORMS, Array(-charge())), "84 of 84 templates end below half"),
-        ({"r": Array(R[::-1].copy(), attrs={"units": "mm"})}, "r does not ascend"),
+        ({"r": Array(R[::-1].copy(), attrs=MM)}, "r does not ascend"),
         ({"z": Array(Z, attrs={"units": "m"})}, "z reaches 7000 mm"),
         ({"r": Array(R, attrs={"units": "inch"})}, "r is in 'inch'"),
-        (
-            {"r": Array(np.arange(4.0), attrs={"units": "mm"})},
-            "expected numbers of shape (r, z, samples)",
-        ),
+        ({"r": Array(np.arange(4.0), attrs=MM)}, "expected numbers of shape (r, z, samples)"),
         ({"waveform_000_deg": Array(without(charge(), 2))}, "1 rows of 000_deg are NaN"),
         ({"waveform_045_deg": Array(without(charge(), np.s_[:]))}, "no template of 045_deg"),
         (

@@ -224,20 +224,6 @@ def test_the_lh5_library_reads_what_was_written(tmp_path_factory, waveforms, dt_
         np.testing.assert_array_equal(getattr(again, name), getattr(pulses, name))
 
 
-def test_dspeed_reads_a_file_buffer_by_buffer(tmp_path):
-    build_dsp = pytest.importorskip("dspeed").build_dsp
-    path, pulses = tmp_path / "pulses.lh5", some(20, 30)
-    write_pulses(path, pulses, table="geds/raw", waveform_units="ADC", attrs={"run": "r001"})
-    largest = {"function": "amax", "module": "numpy", "args": ["waveform", 1, "wf_max"]}
-    largest["kwargs"] = {"signature": "(n),()->()", "types": ["fi->f"]}
-    chain = {"outputs": ["wf_max"], "processors": {"wf_max": largest}}
-    files, sizes = (str(path), str(tmp_path / "dsp.lh5")), {"buffer_len": 8, "block_width": 4}
-    build_dsp(*files, dsp_config=chain, lh5_tables=["geds/raw"], **sizes)
-    (name,) = (n for n in lh5.ls(files[1], "geds/*") if n != "dsp_info")
-    found = lh5.read(f"{name}/wf_max", files[1]).nda
-    np.testing.assert_allclose(found, pulses.waveforms.max(axis=1))
-
-
 @pytest.mark.parametrize("blocks", [[], [some(0)]])
 def test_no_pulses_leave_no_file(tmp_path, blocks):
     with pytest.raises(CpunetError, match=r"pulses.lh5: no pulses to write"):

@@ -28,6 +28,7 @@ from cpunet.pulses.shape_parameters import (
     median_decay_ns,
 )
 from synthetic import PREPARATION, load_recipe
+from synthetic import gaussian_edge as edge
 
 DT_NS = 16.0
 TIME = np.arange(800.0)
@@ -200,11 +201,6 @@ def test_the_documented_table_is_the_registry():
     assert names == tuple(f"`{name}`" for name in SHAPE_PARAMETERS)
     assert units == tuple(parameter.unit for parameter in SHAPE_PARAMETERS.values())
     assert all(all(column) for column in words)
-
-
-def edge(time: np.ndarray, sigma: float) -> np.ndarray:
-    """A Gaussian edge at 0, as after bandwidth poles; exactly 0.5 at time 0."""
-    return ndtr(time / sigma)
 
 
 def uneven(time: np.ndarray) -> np.ndarray:

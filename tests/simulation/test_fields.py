@@ -146,9 +146,8 @@ def test_any_bias_and_impurity_from_one_solution(
         alone = detector.model_copy(update=written | {"bias_V": bias})
         expected = compute_fields(alone)
         for name in ("potential_V", "e_r_V_per_cm", "e_z_V_per_cm", "weighting_potential"):
-            np.testing.assert_allclose(
-                getattr(fields, name), getattr(expected, name), atol=1e-6
-            )
+            both = (getattr(one, name) for one in (fields, expected))
+            np.testing.assert_allclose(*both, atol=1e-6)
         assert fields.depletion_V == pytest.approx(expected.depletion_V, abs=1)
     assert not caplog.messages
 

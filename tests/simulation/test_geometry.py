@@ -35,13 +35,11 @@ def changed(**values: object) -> Detector:
 
 
 def test_rounded_walls_follow_their_profiles() -> None:
-    """Rounded edges and the end of the bore, by their formulas."""
     length, radius = ICPC.crystal_length, ICPC.crystal_radius
     z = np.linspace(0.05, length - 0.05, 700)
     plain = {"outer_taper_length": 0, "bore_length": 69.9, "bore_radius": 5, "grid_mm": 0.1}
-    detector = changed(
-        **plain, top_bullet_radius=6, bottom_bullet_radius=9, bore_bullet_radius=3
-    )
+    rounded = {"top_bullet_radius": 6, "bottom_bullet_radius": 9, "bore_bullet_radius": 3}
+    detector = changed(**plain, **rounded)
     top, bottom, end = (np.clip(x, 0, None) for x in (z - length + 6, 9 - z, 29.1 - z))
     outer = radius - 15 + np.sqrt(36 - top**2) + np.sqrt(81 - bottom**2)
     bore = np.where(z > 26.1, 2 + np.sqrt(np.clip(9 - end**2, 0, None)), np.nan)

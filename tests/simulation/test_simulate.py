@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -52,12 +51,10 @@ def npz(path: Path, hits: Hits) -> Path:
     return path
 
 
-def gammas(**changed: object) -> GammaSource:
+def gammas(seed: int = 4) -> GammaSource:
     lines = energy_windows("FEP,SEP,DEP", load_recipe("fast").peaks, 0.5)
-    source = GammaSource(
-        dict(zip(lines, (30, 3, 3), strict=True)), height_mm=20, radius_mm=5, seed=4
-    )
-    return replace(source, **changed)
+    wanted = dict(zip(lines, (30, 3, 3), strict=True))
+    return GammaSource(wanted, height_mm=20, radius_mm=5, seed=seed)
 
 
 def test_gammas_become_a_file_that_training_reads(ppc, tmp_path: Path):

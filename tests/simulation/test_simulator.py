@@ -57,13 +57,6 @@ def test_charge_is_conserved_and_quarter_turns_change_nothing(
     np.testing.assert_allclose(signals.waveforms[1:], signals.waveforms[[0, 0]], atol=1e-6)
 
 
-def test_samples_are_means_of_their_steps(planar: FieldMaps) -> None:
-    fine = of(planar, SIGGEN).signals(1.0, 2.0, [7.0], 1.0)
-    coarse = of(planar, SIGGEN.model_copy(update={"dt_ns": 16.0})).signals(1.0, 2.0, [7.0], 1.0)
-    means = fine.waveforms.reshape(-1, 16).mean(axis=1)
-    np.testing.assert_allclose(coarse.waveforms[0], means, atol=1e-6)
-
-
 def test_self_repulsion_and_diffusion_widen_the_cloud(planar: FieldMaps) -> None:
     def width(energy_kev: float = 10.0, **values: object) -> float:
         simulator = of(planar, SimulationSettings(**values))  # type: ignore[arg-type]

@@ -14,20 +14,13 @@ from cpunet.training.train import train
 from cpunet.translation.export import export_onnx
 from cpunet.translation.translator import IREN, REN
 from games import SMALL
-from synthetic import (
-    load_recipe,
-    phased_edges,
-    require_drawn,
-    write_line,
-)
+from synthetic import load_recipe, of_parts, phased_edges, require_drawn, write_line
 
 SHORT = ("training.start_factors=[1]", "generator.slow_ns=[]", "generator.fast_decays_us=[]")
-GAME = (
-    "residual.generator.width=2",
-    "residual.training.iterations=6",
-    "residual.training.batch_size=16",
-    "residual.training.cycle_size=8",
-)
+GAME = of_parts("""
+residual.generator width=2
+residual.training iterations=6 batch_size=16 cycle_size=8
+""")
 RECIPE = load_recipe("cpunet", [*SHORT, *GAME])
 
 

@@ -24,7 +24,7 @@ from cpunet.translation import export
 from cpunet.translation.dspeed_processor import ren
 from cpunet.translation.export import chain_model, export_onnx
 from cpunet.translation.translator import IREN, REN
-from synthetic import load_recipe, waveform_table, write_chain
+from synthetic import load_recipe, waveform_table, write_chain, write_pulses
 
 MODULE = "cpunet.translation.dspeed_processor"
 
@@ -166,11 +166,13 @@ def config(run: Path, function: str, args: list[str], *init: Any) -> dict[str, A
     }
 
 
-def test_a_chain_of_ren_on_a_file(chain, sim, tmp_path):
+def test_a_chain_of_ren_on_a_file_that_dspeed_reads_in_buffers(chain, sim, tmp_path):
     waveforms = np.concatenate([sim, sim[:1] * np.nan, sim, sim])
     energy = np.full(len(waveforms), 2000.0)
     energy[2] = np.nan
-    lh5.write(table(waveforms, energy), "raw", str(tmp_path / "sim.lh5"), group="geds")
+    pulses = Pulses.of(waveforms, dt_ns=16, energy_kev=energy)
+    how = {"waveform_units": "ADC", "attrs": {"run": "r001"}}
+    write_pulses(tmp_path / "sim.lh5", pulses, table="geds/raw", **how)
     settings = config(chain, "ren", [], False)
     (tmp_path / "dsp.json").write_text(json.dumps(settings))
     build_dsp(
@@ -183,8 +185,7 @@ def test_a_chain_of_ren_on_a_file(chain, sim, tmp_path):
     )
     (name,) = (n for n in lh5.ls(str(tmp_path / "dsp.lh5"), "geds/*") if n != "dsp_info")
     made = lh5.read(name, str(tmp_path / "dsp.lh5"))
-    translator = REN.load(chain)
-    expected = translator.translate_pulses(Pulses.of(waveforms, dt_ns=16), noise=False)
+    expected = REN.load(chain).translate_pulses(pulses, noise=False)
     found = made["wf_out"]["values"].nda
     assert found.shape == (16, 800)
     np.testing.assert_array_equal(np.isnan(found).all(axis=1), ~expected.valid)

@@ -104,9 +104,6 @@ def names(folder):
     return sorted(path.name for path in folder.iterdir())
 
 
-# --- what is written
-
-
 def require_deposit(half_ns):
     """The half rise of a translated pulse is that of the charge, delayed by two poles."""
     half = (charge() < 0.5).sum(axis=1) * DT_NS
@@ -161,9 +158,6 @@ def test_channels_have_noise_of_their_own(run, tmp_path):
     first, second = (values(tmp_path / "out" / f"ch{i}.lh5")[:, :300] for i in (1, 2))
     together = (first * second).mean() / (first.std() * second.std())
     assert together == pytest.approx(0, abs=0.05)
-
-
-# --- noise and bytes
 
 
 def test_all_that_pulses_can_be_gives_the_same(run, tmp_path):
@@ -265,9 +259,6 @@ def test_resume_skips_what_is_finished_and_refuses_what_was_made_otherwise(
     ):
         with pytest.raises(CpunetError, match=said):
             translate(of, sources, f"{out}/", **options, resume=True)
-
-
-# --- ADC counts
 
 
 @pytest.mark.parametrize("adc", [Adc(), ADC])
@@ -457,9 +448,6 @@ def test_runs_that_tell_of_no_tails(run, network):
             translate(folder, simulated(), tails="1")
         with pytest.raises(CpunetError, match=r"tells nothing of .* other pulses"):
             translate(folder, simulated(), pile_up_khz=1)
-
-
-# --- what can go wrong
 
 
 def test_a_file_that_changes_meanwhile_gives_no_output(run, tmp_path, monkeypatch):

@@ -22,6 +22,7 @@ from cpunet.validation.figures import shape_figure
 from cpunet.validation.methods import true_responses
 from cpunet.validation.peaks import MeanPulse, around_half, sliced
 from synthetic import LOSS_NAMES, load_recipe, paired_scores, require_drawn
+from synthetic import gaussian_edge as edge
 
 SCORES = load_recipe("fast").scores.model_copy(update={"bootstraps": 10})
 DT = 16.0
@@ -35,7 +36,7 @@ def log(n: int) -> list[dict]:
 
 def edges(widths, centre=250.0):
     time = np.arange(600) - centre
-    return ndtr(time / np.asarray(widths)[:, np.newaxis]).astype(np.float32)
+    return edge(time, np.asarray(widths)[:, np.newaxis]).astype(np.float32)
 
 
 def test_further_parameters_are_drawn_each():
@@ -175,11 +176,6 @@ def test_nothing_in_a_slice_is_no_failure():
     assert all(pulse.n == 0 for pulse in means["raw"][1:])
     columns = {str(i): {m: of[i] for m, of in means.items()} for i in (1, 2)}
     require_drawn(shape_figure(columns, DT, "SEP"))
-
-
-def edge(time: np.ndarray, sigma: float) -> np.ndarray:
-    """A Gaussian edge at 0, as after bandwidth poles; exactly 0.5 at time 0."""
-    return ndtr(time / sigma)
 
 
 @given(shift=st.floats(-40, 40), sigma=st.floats(3, 20))
