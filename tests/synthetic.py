@@ -417,8 +417,8 @@ def in_a_process(
     """Run commands in a process of their own, one after the other, between other lines."""
     program = PROGRAM.format(before=before, after=after)
     words = [sys.executable, "-W", "error", "-c", program, *commands]
-    environment = os.environ | environment
-    return subprocess.run(words, capture_output=True, text=True, check=False, env=environment)
+    how = {"capture_output": True, "errors": "surrogateescape", "env": os.environ | environment}
+    return subprocess.run(words, text=True, check=False, **how)
 
 
 @contextmanager
