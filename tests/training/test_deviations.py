@@ -45,7 +45,7 @@ def plain() -> Unpaired:
 
 @pytest.fixture(scope="module")
 def rings() -> Unpaired:
-    return measured_with(RINGS, 1500)
+    return measured_with(RINGS, 1000)
 
 
 def deviating(response: ElectronicsResponse, deviation: np.ndarray) -> ElectronicsResponse:
@@ -104,8 +104,7 @@ def test_a_ringing_is_learned_and_its_lack_is_bad(rings):
 @pytest.mark.parametrize("factor", [0.9, 1.15])
 def test_other_physics_are_bad(plain, factor):
     """No linear readout makes up for a drift that is longer or shorter."""
-    other = plain._replace(sim=simulated(faster(charge(1500, seed=1), factor)))
-    sides = sides_of(other)
+    sides = sides_of(plain._replace(sim=simulated(faster(charge(1500, seed=1), factor))))
     found, _ = with_deviations(true_response(), [sides], lambda _: None)
     told, _ = verdict(found, [sides])
     assert not told.good

@@ -16,7 +16,9 @@ from cpunet.translation.translator import IREN, REN
 from games import SMALL
 from synthetic import load_recipe, of_parts, phased_edges, require_drawn, write_line
 
-SHORT = ("training.start_factors=[1]", "generator.slow_ns=[]", "generator.fast_decays_us=[]")
+# more poles than these pulses have take long to be looked for
+ONE_POLE = ("generator.poles_ns=[60]", "generator.slow_ns=[]", "generator.fast_decays_us=[]")
+SHORT = (*ONE_POLE, "training.start_factors=[1]")
 GAME = of_parts("""
 residual.generator width=2
 residual.training iterations=6 batch_size=16 cycle_size=8
