@@ -116,7 +116,7 @@ def test_a_run_whose_training_was_not_published_says_no_more_than_is_known(run) 
 def test_a_missing_peak_is_told_and_the_rest_stands(run, files, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr("cpunet.validation.drawings.drawings", lambda found: {})  # above
     sides = files["sim"], files["no DEP"]
-    report = validate(run, *sides, tmp_path / "report", baselines=False)
+    report = validate(run, *sides, tmp_path / "report", baselines=False, max_pulses=200)
     metrics = report.metrics
     assert f"DEP: not scored, {metrics.peaks['DEP'].missing}" in str(report)
     assert metrics.peaks["DEP"].missing.startswith("no measured pulses")
