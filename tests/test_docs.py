@@ -37,6 +37,8 @@ BLOCK = re.compile(r"^```(\w*)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 # Seconds of simulation or training each, or files that it would take: their imports are tried
 # only.
 TOO_LONG = {"simulation.md", "legend.md", "python.md"}
+# a fit that looks for no other valley, whatever it has found
+SHORT = ("start_factors=[1]",)
 MADE_BY_THE_SITE = ("reference/", "../reference/")
 DOCS = ROOT / "docs"
 HOOKS = DOCS / "hooks"
@@ -138,10 +140,6 @@ def slugify(title: str) -> str:
     """The anchor of a heading."""
     words = re.sub(r"[^\w\s-]", "", title.lower()).strip()
     return re.sub(r"[-\s]+", "-", words)
-
-
-SHORT = ("start_factors=[1]",)
-"""A fit that looks for no other valley, whatever it has found."""
 
 
 @pytest.fixture(scope="module")

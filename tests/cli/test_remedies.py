@@ -2,7 +2,7 @@
 
 Advice that needs data of its own is followed where that is tested: longer windows in
 ``test_check.py``, other energies of a training in ``test_mistakes.py``, impurities and voltages
-that metadata lack in ``test_geometry_readers.py``, `resume` in ``test_resume.py``.
+that metadata lack in ``test_geometry_readers.py``, `resume` in ``test_environments.py``.
 """
 
 from __future__ import annotations

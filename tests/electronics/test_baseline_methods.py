@@ -32,6 +32,8 @@ FINE_NS = DT_NS / STEPS
 N_FINE = 1200 * STEPS
 TIME_NS = np.arange(N_FINE) * FINE_NS
 NOISE = 4e-4  # of the pulse height, as in a good detector
+RC_LATE = {"tau_ns": (60, 0.1), "late_share": (0.07, 0.2), "late_ns": (500, 0.35)}
+NARROW, WIDE = ({"sigma_ns": (s, 0.03), "tau_ns": (t, 0.03)} for s, t in ((30, 60), (20, 90)))
 
 
 def ideal(n: int, seed: int) -> FloatArray:
@@ -97,10 +99,6 @@ def gauss_exp_step(sigma_ns: float, tau_ns: float) -> np.ndarray:
 def rc_late_step(tau_ns: float, late_share: float, late_ns: float) -> np.ndarray:
     late = Exponentials.low_pass(late_ns, late_share)
     return (Exponentials.low_pass(tau_ns) * late).step(TIME_NS)
-
-
-RC_LATE = {"tau_ns": (60, 0.1), "late_share": (0.07, 0.2), "late_ns": (500, 0.35)}
-NARROW, WIDE = ({"sigma_ns": (s, 0.03), "tau_ns": (t, 0.03)} for s, t in ((30, 60), (20, 90)))
 
 
 @pytest.mark.parametrize(

@@ -35,11 +35,9 @@ def test_a_stretched_drift_is_not_in_the_parameters(
 
 def report(folder: Path, **changes: Any) -> Path:
     folder.mkdir()
-    metrics = {
-        "peaks": {},
-        "training": {"recipe": "fast", "peak": "FEP", "seed": 0},
-        "ae_energy": {"multi_site": False, "methods": {"data": METHOD, "ren": METHOD}},
-    }
+    training = {"recipe": "fast", "peak": "FEP", "seed": 0}
+    found = {"multi_site": False, "methods": {"data": METHOD, "ren": METHOD}}
+    metrics = {"peaks": {}, "training": training, "ae_energy": found}
     (folder / "metrics.json").write_text(json.dumps(metrics | changes))
     return folder
 

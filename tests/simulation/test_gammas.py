@@ -121,9 +121,8 @@ SHAPES: dict[str, Detector] = {name: read_detector(name) for name in detector_na
 @pytest.mark.parametrize("detector", SHAPES.values(), ids=SHAPES)
 def test_no_hit_lies_outside_its_detector(detector: Detector) -> None:
     for height in (1.0, 80.0):
-        hits, _ = simulate_gammas(
-            detector, source_height_mm=height, source_radius_mm=20, n_primaries=20_000, seed=7
-        )
+        source = {"source_height_mm": height, "source_radius_mm": 20}
+        hits, _ = simulate_gammas(detector, **source, n_primaries=20_000, seed=7)
         assert len(hits.edep_kev) > 100_000
         assert hits.energy_kev.max() <= TL208_KEV + 1e-6
         assert detector.inside(np.hypot(hits.x_mm, hits.y_mm), hits.z_mm).all()

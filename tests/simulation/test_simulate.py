@@ -29,8 +29,6 @@ SETTINGS = {"length_ns": 1600}
 # in the bulk; half in the lithium layer (the top 1 mm); all in it; all outside
 PLACES = [[10, 0, 20], [12, 0, 25], [5, 0, 45.5], [5, 3, 45.6], [0, 0, 300]]
 HITS = Hits.of(PLACES, [1000, 600, 600, 2614.5, 500], [0, 1, 3, 4, 5], [7, 3, 20, 21])
-
-
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 

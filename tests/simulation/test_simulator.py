@@ -23,8 +23,6 @@ from cpunet.simulation.simulator import Simulator, merge_hits
 PLAIN = SimulationSettings(dt_ns=1, length_ns=3600, diffusion=False, cloud_fwhm_mm=0)
 CLOUDS = {"diffusion": True, "diffusion_constant": "siggen", "cloud_fwhm_mm": 0.1}
 SIGGEN = PLAIN.model_copy(update=CLOUDS)
-
-
 ICPC = read_detector("icpc")  # at 90 K, as the reference pulses
 Array = npt.NDArray[np.float64]
 TABLE = velocity_table(90)

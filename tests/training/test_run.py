@@ -22,10 +22,9 @@ from synthetic import nearly_full_disk, one_line, write_run
 
 INFO = {"recipe": "published", "peak": "FEP", "seed": 1, "dt_ns": 16.0}
 INFO |= {"seconds": 1.5, "device": "cpu"}
-
-
 RECIPE = as_published("discriminator.value_range=[-0.1, 1.1]")
 BEGUN = {"recipe": {"training": {"batch_size": 4}}, "seed": 3}
+NO_WEIGHTS = f"{WEIGHTS}: no readable weights; train again"
 
 
 @pytest.fixture
@@ -53,9 +52,6 @@ def test_everything_comes_back(run, model):
 
 def facts(**changes: object) -> str:
     return json.dumps(INFO | {"format": FORMAT} | changes)
-
-
-NO_WEIGHTS = f"{WEIGHTS}: no readable weights; train again"
 
 
 @pytest.mark.parametrize(

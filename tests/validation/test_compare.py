@@ -19,6 +19,12 @@ from cpunet.validation.metrics import Metrics
 from cpunet.validation.report import Report
 
 NAMES = ("drift_time", "current_amplitude", "tail_slope", "rise_time")
+DEFECTS = {
+    "no-json": (b"{", "damaged"),
+    "no-text": (b"\xff\xfe\xff", "damaged"),
+    "a-list": (b"[1]", "damaged (no mapping)"),
+    "no-peaks": (b'{"peaks": 3}', "holds no scores by peak"),
+}
 
 
 def scores(*ious: float, auc: float = 0.52, off: float = 1.0) -> dict[str, Any]:
@@ -208,14 +214,6 @@ def test_the_command(two, tmp_path, capsys):
     assert "no report: none" in capsys.readouterr().out
     with pytest.raises(CpunetError, match="is a folder; give the name of a page"):
         compare(*two, out=page.parent, force=True)
-
-
-DEFECTS = {
-    "no-json": (b"{", "damaged"),
-    "no-text": (b"\xff\xfe\xff", "damaged"),
-    "a-list": (b"[1]", "damaged (no mapping)"),
-    "no-peaks": (b'{"peaks": 3}', "holds no scores by peak"),
-}
 
 
 @pytest.mark.parametrize("defect", DEFECTS)

@@ -139,11 +139,9 @@ def test_two_samples_of_one_distribution_are_rarely_beyond_two_sigma(shape):
         assert values.std() == pytest.approx(1, abs=0.2), name
 
 
-WAYS = {"events": comparisons.MAX_EVENTS, "bins": 0}  # what is drawn
-
-
-@pytest.fixture(params=WAYS.values(), ids=WAYS.keys())
+@pytest.fixture(params=[comparisons.MAX_EVENTS, 0], ids=["events", "bins"])
 def either_way(request, monkeypatch):
+    """Events are drawn, or the contents of bins."""
     monkeypatch.setattr(comparisons, "MAX_EVENTS", request.param)
 
 

@@ -9,8 +9,6 @@ from cpunet.validation.figures import spectrum_of_noise
 from cpunet.validation.noise import baseline_spectra
 
 SAMPLES, DT_NS = 200, 16.0
-
-
 LATE = 300.0  # sample at which pulses begin that are no concern here
 
 

@@ -17,6 +17,14 @@ from cpunet.translation.translator import REN
 from cpunet.validation.tune import HeldOut, own_values, tune
 from synthetic import KEV, SMALL_NETWORK, Files, load_recipe, write_files
 
+optuna = pytest.importorskip("optuna")
+Choice = optuna.distributions.CategoricalDistribution
+Real = optuna.distributions.FloatDistribution
+FIT = {
+    "training.level_ns": Real(100, 2000, log=True),
+    "training.before_ns": Choice([2048.0, 2000.0]),
+}
+
 
 @pytest.fixture(scope="module")
 def files(tmp_path_factory: pytest.TempPathFactory) -> Files:
@@ -68,11 +76,6 @@ def test_the_score_is_1_for_data_beside_data_and_more_for_what_is_not(files):
         parts.score(Giving(lost))
 
 
-optuna = pytest.importorskip("optuna")
-Choice = optuna.distributions.CategoricalDistribution
-Real = optuna.distributions.FloatDistribution
-
-
 @pytest.mark.parametrize(
     ("space", "words"),
     [
@@ -101,12 +104,6 @@ def tried(monkeypatch) -> list[float]:
     monkeypatch.setattr(HeldOut, "train", lambda _self, recipe: recipe)
     monkeypatch.setattr(HeldOut, "score", score)
     return tried
-
-
-FIT = {
-    "training.level_ns": Real(100, 2000, log=True),
-    "training.before_ns": Choice([2048.0, 2000.0]),
-}
 
 
 def states(study: Any) -> list[str]:

@@ -53,6 +53,30 @@ elif words[0] != "demo":
 ALL = ("-c2", "--show-failed-logs")
 DETECTORS = ("V99000A", "B99000A")
 ORIGIN_M = {"V99000A": (0.1, 0.0, -0.2), "B99000A": (0.0, -0.1, 0.3)}
+SIMULATE = "detectors.V01.simulate"
+DEFECTS: dict[str, dict[str, object]] = {
+    "train: Additional properties are not allowed ('recipes' was": {"train.recipes": "fast"},
+    "needs either simulate or simulations": {"detectors.V01.simulations": None},
+    "periods.p03.data: no file matches none/*.lh5": {"periods.p03.data": "none/*.lh5"},
+    "detectors.V01.periods: p05 is not in periods": {"detectors.V01.periods": ["p05"]},
+    "detectors.V01: library takes its geometry; give simulate": {"library": {"grid_mm": 2}},
+    "detectors.B02: no energy, the column in the files of periods.p03.energies": {
+        "periods.p03.energies": "raw p03/*.lh5"
+    },
+}
+CHAIN_DEFECTS: dict[str, dict[str, object]] = {
+    f"{SIMULATE}.files: calibrate takes one file, with its hits": {
+        "calibrate": {},
+        f"{SIMULATE}.files": 2,
+    },
+    f"{SIMULATE}.hits: 2 files, and calibrate takes one": {
+        "calibrate": {},
+        SIMULATE: {"detector": "icpc", "hits": "stp/*.lh5"},
+    },
+    "events.dsp: no file none.yaml; give a chain of dspeed, or leave": {
+        "events.dsp": "none.yaml"
+    },
+}
 
 
 @dataclass(frozen=True)
@@ -161,18 +185,12 @@ def test_dry_run(place):
 def whole_chain() -> dict[str, Any]:
     """Calibration, libraries and events of two detectors, one of them in one period."""
     config: Any = two_detectors()
-    config["detectors"]["V01"] = {
-        "simulate": {"detector": "icpc", "events": "FEP=9"},
-        "stp": "det001",
-        "table": "ch1/raw",
-    }
+    simulate = {"detector": "icpc", "events": "FEP=9"}
+    config["detectors"]["V01"] = {"simulate": simulate, "stp": "det001", "table": "ch1/raw"}
     config["periods"]["p04"] = {"data": "raw*/*.lh5"}
     config["detectors"]["B02"]["periods"] = ["p03"]
-    config["library"] = {
-        "grid_mm": 2,
-        "make": ["--set=dt_ns=2"],
-        "translate": ["--detector=V01"],
-    }
+    config["library"] = {"grid_mm": 2, "make": ["--set=dt_ns=2"]}
+    config["library"]["translate"] = ["--detector=V01"]
     config["events"] = {"hits": "stp/*.lh5", "translate": ["--length=2000"], "tau_us": 400}
     del config["train"]["set"]
     return config
@@ -266,32 +284,6 @@ def test_a_failure_stops_no_other_detector(place):
     assert measured == {"train.tsv", "translate-of a.tsv", "validate.tsv"}
 
     assert "Nothing to be done" in place.run("-c1", "--dry-run").stdout
-
-
-SIMULATE = "detectors.V01.simulate"
-DEFECTS: dict[str, dict[str, object]] = {
-    "train: Additional properties are not allowed ('recipes' was": {"train.recipes": "fast"},
-    "needs either simulate or simulations": {"detectors.V01.simulations": None},
-    "periods.p03.data: no file matches none/*.lh5": {"periods.p03.data": "none/*.lh5"},
-    "detectors.V01.periods: p05 is not in periods": {"detectors.V01.periods": ["p05"]},
-    "detectors.V01: library takes its geometry; give simulate": {"library": {"grid_mm": 2}},
-    "detectors.B02: no energy, the column in the files of periods.p03.energies": {
-        "periods.p03.energies": "raw p03/*.lh5"
-    },
-}
-CHAIN_DEFECTS: dict[str, dict[str, object]] = {
-    f"{SIMULATE}.files: calibrate takes one file, with its hits": {
-        "calibrate": {},
-        f"{SIMULATE}.files": 2,
-    },
-    f"{SIMULATE}.hits: 2 files, and calibrate takes one": {
-        "calibrate": {},
-        SIMULATE: {"detector": "icpc", "hits": "stp/*.lh5"},
-    },
-    "events.dsp: no file none.yaml; give a chain of dspeed, or leave": {
-        "events.dsp": "none.yaml"
-    },
-}
 
 
 # each starts snakemake
