@@ -124,7 +124,8 @@ def test_a_readout_is_used_without_torch_and_what_networks_need_is_named(tmp_pat
     )
     said = "error: networks need torch, which is not installed; pip install 'cpunet-hpge["
     assert done.stderr.splitlines()[-1] == f"{said}networks]'"
-    assert sorted(tmp_path.iterdir()) == sorted([run, *outs])
+    names = sorted(path.name for path in tmp_path.iterdir())
+    assert names == ["a", "b", "c", "c.noise.npz", "run"]
 
 
 @pytest.mark.thorough
