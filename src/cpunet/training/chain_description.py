@@ -49,7 +49,7 @@ _RISES = {"rise_10_90_ns": 0.1, "rise_1_99_ns": 0.01, "rise_0.1_99.9_ns": 0.001}
 _PLATEAU, _SMOOTHED = (0.03, 0.1), 41
 _MIN_SLOW = 0.005  # share of the charge below which a mean time is meaningless
 _FOREVER_US = 1e9  # decay time of a chain without decay
-MAX_AXES = 12  # of the errors of a deviation, of which the others are negligible
+FEW_AXES = 6  # of the errors of a deviation: the largest, and of the others relative ones
 # The division of a chain into parts is degenerate, and times of slow parts and decays are
 # fixed: a true part between two of them is split, which the errors do not contain.
 PARTS = re.compile(r"slow_|decay_|fast_decay_")
@@ -270,14 +270,20 @@ def moved_along_axes(
 
 
 def error_ends(
-    response: ElectronicsResponse, covariance: Sequence[Sequence[float]]
+    response: ElectronicsResponse, covariance: Sequence[Sequence[float]], *, few: bool = False
 ) -> list[tuple[ElectronicsResponse, ElectronicsResponse]]:
-    """A response at both ends of each axis of its error ellipsoid."""
+    """A response at both ends of each axis of its error ellipsoid, or of a few that matter.
+
+    Edges have the largest errors. Those of tails are small at each sample, but all alike.
+    """
     parameters, matrix = SmoothParameters(response, poles=False), np.asarray(covariance, float)
     here, deviates = parameters.vector(), response.config.deviations
     if deviates:  # draws of its deviation contain the parameters of the chain
-        _, sizes, axes = np.linalg.svd(response.deviation_draws, full_matrices=False)
-        moves = (sizes[:, np.newaxis] * axes)[:MAX_AXES]
+        moves = response.deviation_draws
+        if few:
+            edges, rest = _largest(moves, 1.0)
+            tails, _ = _largest(rest, np.linalg.norm(rest, axis=0).clip(1e-12))
+            moves = np.concatenate([edges, tails])
     elif matrix.shape == (len(here), len(here)) and np.isfinite(matrix).all():
         turn = parameters.turn()
         variances, axes = np.linalg.eigh(turn @ matrix @ turn.T)
@@ -294,6 +300,13 @@ def error_ends(
         return moved
 
     return [(end(move), end(-move)) for move in moves]
+
+
+def _largest(draws: FloatArray, unit: FloatArray | float) -> tuple[FloatArray, FloatArray]:
+    """The largest axes of draws in a unit at each lag, and what these leave of the draws."""
+    among, sizes, axes = np.linalg.svd(draws / unit, full_matrices=False)
+    axes = (sizes[:, np.newaxis] * axes * unit)[:FEW_AXES]
+    return axes, draws - among[:, :FEW_AXES] @ axes
 
 
 @dataclass(frozen=True, eq=False)

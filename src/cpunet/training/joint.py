@@ -14,7 +14,7 @@ from cpunet.networks.response_layer import Spectrum
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Aligned, Changes, Derivatives, Floats, Values
 from cpunet.training.comparison import Difference
-from cpunet.training.pulse_sets import Sides
+from cpunet.training.pulse_sets import MOSTLY, Sides
 
 COMPONENTS, SEGMENTS, BINS = 24, 20, 16
 CLIPPED = 4.0  # robust standard deviations at which components and segments are clipped
@@ -26,7 +26,6 @@ SHRUNK = 0.05  # share of a diagonal matrix in the covariance
 # highest, and bins about it.
 PEAK_WIDTH, ABOUT_PEAK = 0.01, np.linspace(-0.03, 0.02, 10)
 FOR_PRODUCTS = 600  # pulses of a side, of which products have a covariance
-MOSTLY = 0.8  # part of the simulated pulses that is single near the data
 TINY = 1e-9  # least scale
 PARTS = 20  # of the pulses, which say how differences go with derivatives
 

@@ -41,9 +41,11 @@ PLATEAU_NS = 1600.0  # after the window, over which the mean gives the height of
 # Times in ns from the half height between which every sample is compared, shortest and longest
 # stretches within and elsewhere, and samples compared per pulse at most.
 DENSE_NS, FINEST_NS, COARSE_NS, FEWEST = (-1000.0, 3000.0), 8.0, 64.0, 1.3
-# A measured pulse with another before it, or on its tail: height of its baseline, time from
-# which the tail counts, and its RMS in units of the median.
-QUIET, TAIL_NS, LATE_RMS = 0.05, 2400.0, 4.0
+# A pulse with another before it, or on its tail, as one that is collected late seems to be:
+# height of its baseline, time from which the tail counts, and its deviation from the others in
+# robust standard deviations, fewer than those of the quality cuts that the data have passed.
+QUIET, TAIL_NS, FAR = 0.05, 1600.0, 5.0
+MOSTLY = 0.8  # of the simulated pulses are single, unless they are far from the data
 
 SINGLE = "single sites of the continuum"
 
@@ -171,7 +173,9 @@ class Sides:
         late = every.pulses[:, self.late]
         self.middle = np.median(late, axis=0)
         self.spread = np.median(np.abs(late - self.middle), axis=0)
-        self.widest = LATE_RMS * float(np.median(self.late_rms(every)))
+        tails = self.tails(every)
+        self.usual = np.median(tails, axis=0)
+        self.widest = FAR * 1.4826 * np.median(np.abs(tails - self.usual), axis=0)
         single = self.single(every)
         self.data, self.left_out = every[single], int((~single).sum())
         self.divide()
@@ -241,16 +245,23 @@ class Sides:
             some.noise.left = self.noise.left[:, rows]
         return some
 
-    def late_rms(self, aligned: Aligned) -> Values:
-        """RMS of the tail of each pulse about the median, in units of the spread."""
+    def tails(self, aligned: Aligned) -> Values:
+        """Slope and RMS of the tail of each pulse about the median, shape (pulses, 2)."""
         deviation = (aligned.pulses[:, self.late] - self.middle) / self.spread
-        return np.asarray(np.sqrt((deviation**2).mean(axis=1)))
+        slope = deviation @ np.linspace(-1.0, 1.0, deviation.shape[1])
+        return np.column_stack([slope, np.sqrt((deviation**2).mean(axis=1))])
 
     def single(self, aligned: Aligned) -> npt.NDArray[np.bool_]:
-        """Which pulses have no other before them or on their tail."""
+        """Which pulses have no other before them or on their tail, and are collected by then."""
         base = aligned.pulses[:, : self.frame.before // 4].mean(axis=1)
-        quiet: npt.NDArray[np.bool_] = np.abs(base) < QUIET
-        return quiet & (self.late_rms(aligned) < self.widest)
+        near: npt.NDArray[np.bool_] = np.abs(self.tails(aligned) - self.usual) < self.widest
+        return near.all(axis=1) & (np.abs(base) < QUIET)
+
+    def like_data(self, response: ElectronicsResponse) -> Sides:
+        """Without the simulated pulses that cuts would leave out behind a response."""
+        clean, heights = self.translated(response.transfer(self.padded))
+        single = self.single(self.read(clean, heights, 0))
+        return self.of_events(single) if single.mean() > MOSTLY else self
 
     def view(self, aligned: Floats) -> Floats:
         """Means of aligned pulses over the stretches, shape (pulses, stretches)."""

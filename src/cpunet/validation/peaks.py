@@ -283,7 +283,7 @@ def fit_ends(run: Run, ren: REN) -> Ends:
     if run.fit is None or not isinstance(ren.backend, ResponseBackend):
         return []
     ends = []
-    for pair in error_ends(ren.backend.network.response, run.fit.covariance):
+    for pair in error_ends(ren.backend.network.response, run.fit.covariance, few=True):
         both = copy.copy(ren), copy.copy(ren)
         for moved, response in zip(both, pair, strict=True):
             moved.backend = copy.copy(ren.backend)
