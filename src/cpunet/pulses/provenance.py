@@ -21,7 +21,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, line_slope
-from cpunet.pulses.parameters import tail_slope
+from cpunet.pulses.parameters import Values, tail_slope
 from cpunet.pulses.peaks import label_peaks, suggested_calibration
 from cpunet.pulses.reading.source import PulseSource, amplitude
 from cpunet.recipes.schema import PeakConfig, PreparationConfig, Recipe
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Words = list[tuple[str, str]]
-Values = npt.NDArray[np.float64]
 
 # attributes of a table, and of a file
 SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (

@@ -19,12 +19,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, blocks
+from cpunet.pulses.parameters import Values
 
-Values = npt.NDArray[np.float64]
 Parameters = Mapping[str, Values]
 
 MIN_PULSES = 40  # pulses per side: 8 in each test fold

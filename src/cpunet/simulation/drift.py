@@ -16,13 +16,6 @@ from cpunet.simulation.drift_maps import HOLE, DriftMaps, carrier_velocity, in_d
 from cpunet.simulation.geometry import FloatArray
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
-# 2.355**2 times 0.12 V mm/cm, as rounded in siggen
-SIGGEN_DIFFUSION = 0.67
-BOLTZMANN_V_PER_K = 8.617333e-5
-# siggen's self-repulsion of a cloud of 1 keV: 0.003 keV per electron-hole pair, a relative
-# permittivity of 16, and its rounded FWHM per sigma
-REPULSION_PER_KEV = 1.0 / 0.003 / 6.241e18 * 0.67**3 * 9e13 / 16 * 2.355**3
-SMALLEST_FWHM_MM = 0.01  # initial FWHM of a cloud that grows, at least
 _MAX_REPULSION = 0.05
 _CUT_FWHM = 2.0
 
@@ -71,12 +64,7 @@ def cloud_after_step(
 
 @kernel(fastmath=True)
 def smear_and_sample(
-    signal: FloatArray,
-    per_sample: int,
-    sigma: float,
-    last: int,
-    weight: float,
-    out: FloatArray,
+    signal: FloatArray, per_sample: int, sigma: float, last: int, weight: float, out: FloatArray
 ) -> None:
     r"""Convolve a signal with a Gaussian, average it over blocks and add it to `out`.
 

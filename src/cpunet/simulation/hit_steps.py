@@ -15,14 +15,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import units_of
-from cpunet.pulses.reading.source import (
-    Texts,
-    divides,
-    dividing,
-    labels,
-    texts,
-    whole_numbers,
-)
+from cpunet.pulses.reading.source import Texts, divides, dividing, labels, texts, whole_numbers
 from cpunet.simulation.geometry import FloatArray, IntArray
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.units import factor, unit_names

@@ -14,20 +14,20 @@ from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
-from cpunet.simulation.drift import (
-    BOLTZMANN_V_PER_K,
-    FWHM_PER_SIGMA,
-    REPULSION_PER_KEV,
-    SIGGEN_DIFFUSION,
-    SMALLEST_FWHM_MM,
-    drift,
-    smear_and_sample,
-)
+from cpunet.simulation.drift import FWHM_PER_SIGMA, drift, smear_and_sample
 from cpunet.simulation.drift_maps import ELECTRON, HOLE, DriftMaps, drift_maps, in_active_volume
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import BoolArray, Detector, FloatArray, IntArray
 from cpunet.simulation.hits import Hits, OpenHits
 from cpunet.simulation.settings import SimulationSettings
+
+# 2.355**2 times 0.12 V mm/cm, as rounded in siggen
+SIGGEN_DIFFUSION = 0.67
+BOLTZMANN_V_PER_K = 8.617333e-5
+# siggen's self-repulsion of a cloud of 1 keV: 0.003 keV per electron-hole pair, a relative
+# permittivity of 16, and its rounded FWHM per sigma
+REPULSION_PER_KEV = 1.0 / 0.003 / 6.241e18 * 0.67**3 * 9e13 / 16 * 2.355**3
+SMALLEST_FWHM_MM = 0.01  # initial FWHM of a cloud that grows, at least
 
 _CHUNK = 25  # events per task of a thread
 _QUICK_STRIDE = 5  # most time steps that a step of the drift of quick pulses replaces

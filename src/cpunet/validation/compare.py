@@ -264,8 +264,19 @@ def compared(
         file = next((f for f in files if f.is_file() and path not in failed), None)
         stored = Report(read_metrics(file), folder=file.parent) if file else None
         opened.append((path, stored))
-    places = [place for place, _ in opened]
-    named = {name: of for name, (_, of) in zip(_names(places), opened, strict=True)}
+    # by its folder, with as many parent folders as make it unique, without those at the end
+    # that all reports share, such as ``report``
+    places = [place.resolve() for place, _ in opened]
+    parts = [(path.parent if path.is_file() else path).parts for path in places]
+    while len(set(parts)) == len(parts) > 1 and len({part[-1] for part in parts}) == 1:
+        parts = [part[:-1] for part in parts]
+    for depth in range(1, max(map(len, parts), default=1) + 1):
+        names = [str(Path(*part[-depth:])) for part in parts]
+        if len(set(names)) == len(names):
+            break
+    else:  # names that are still equal refer to the same report
+        names = [f"{part[-1]} ({i})" for i, part in enumerate(parts, start=1)]
+    named = {name: of for name, (_, of) in zip(names, opened, strict=True)}
     runs = {name: report for name, report in named.items() if report is not None}
     if not runs:
         raise CpunetError(
@@ -309,20 +320,3 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
 def _union(names: Iterable[Iterable[str]]) -> list[str]:
     """All names in the order of their first occurrence."""
     return list(dict.fromkeys(name for some in names for name in some))
-
-
-def _names(reports: Sequence[Path]) -> list[str]:
-    """Name each report by its folder, with as many parent folders as make it unique.
-
-    Folders at the end that all reports share, such as ``report``, are left out.
-    """
-    given = [report.resolve() for report in reports]
-    parts = [(path.parent if path.is_file() else path).parts for path in given]
-    while len(set(parts)) == len(parts) > 1 and len({part[-1] for part in parts}) == 1:
-        parts = [part[:-1] for part in parts]
-    for depth in range(1, max(map(len, parts), default=1) + 1):
-        names = [str(Path(*part[-depth:])) for part in parts]
-        if len(set(names)) == len(names):
-            return names
-    # names that are still equal refer to the same report
-    return [f"{part[-1]} ({i})" for i, part in enumerate(parts, start=1)]

@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.electronics.baseline_methods import BASELINE_METHODS, BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
@@ -34,12 +33,11 @@ from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.other_formats import read_arrays
+from cpunet.simulation.geometry import BoolArray
 from cpunet.translation.translator import REN
 from cpunet.validation.metrics import PairedScores
 
 log = logging.getLogger(__name__)
-
-Flags = npt.NDArray[np.bool_]
 
 
 def true_responses(path: Path, sim: InputSet) -> FloatArray:
@@ -224,10 +222,10 @@ class Translations:
     ren: REN
     baselines: FittedBaselineMethods
     windows: dict[str, FloatArray]
-    whole: dict[str, Flags]
+    whole: dict[str, BoolArray]
     energy_kev: dict[str, Values]
     amplitudes: dict[str, Values]
-    comparable: Flags
+    comparable: BoolArray
     squares: dict[str, Values]
     truth: FloatArray | None
 
@@ -277,7 +275,7 @@ def translate_all(
         return finish(records, config, dt_ns=ren.dt_ns, noise=noise, energy_kev=kev, seed=rng)
 
     noisy, squares = (defaultdict[str, list[Any]](list) for _ in range(2))
-    comparable: list[Flags] = []
+    comparable: list[BoolArray] = []
     truth: list[FloatArray] = []
     with stage("Translating", len(pulses)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         for rows in blocks(len(pulses)):

@@ -31,10 +31,10 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
+from cpunet.pulses.baselines import Rows
 from cpunet.pulses.container import FloatArray, Pulses
 from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
@@ -55,7 +55,6 @@ MIN_PULSES = 10  # minimum number of pulses of a distribution
 MOVED = 300  # pulses of a peak, for which the errors of a fit are calculated
 FIT_DRAWS = 8  # of the parameters, for the classifier
 
-Rows = npt.NDArray[np.int64]
 ByMethod = dict[str, dict[str, Values]]
 Ends = Sequence[tuple[REN, REN]]
 

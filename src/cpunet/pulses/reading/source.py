@@ -443,7 +443,7 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             sampling period.
         """
         size, start = min(size, max(1, BLOCK_BYTES // (4 * self.length))), 0
-        while start != self.n_pulses and len(pulses := self._pulses(start, start + size)):
+        while start != self.n_pulses and len(pulses := self.read(start, start + size)):
             yield pulses
             start += len(pulses)
         if start == 0:
@@ -457,11 +457,7 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     def read(self, start: int = 0, stop: int | None = None) -> Pulses:
         """Read all pulses of the file, or some rows, at once; they must fit in memory."""
         if stop is None:
-            return Pulses.concatenate(list(self.blocks()))
-        return self._pulses(start, stop)
-
-    def _pulses(self, start: int, stop: int) -> Pulses:
-        """Traces of some rows with their energies, numbers and times."""
+            return Pulses.concatenate(list(self.blocks()))[start:]
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(self.rows(start, stop), np.float32)
         n = len(waveforms)
