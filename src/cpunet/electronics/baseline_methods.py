@@ -35,7 +35,7 @@ from cpunet.electronics.chain import FloatArray as Values
 from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, blocks
-from cpunet.pulses.parameters import crossings, current_amplitude, tail_slope
+from cpunet.pulses.parameters import crossings, current_amplitude, shorth, tail_slope
 
 MIN_PULSES = 50  # of either dataset, for a fit
 TAIL_SHARE = 0.75  # of the time after the alignment: 4.8 of 6.4 us, as in the paper
@@ -216,22 +216,6 @@ def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
         tau_ns = dt_ns * float(scipy.optimize.brentq(excess, 1.0, longest, xtol=TOLERANCE))
     rate, delay = dt_ns / tau_ns, np.exp(-2j * np.pi * scipy.fft.rfftfreq(current.shape[1]))
     return np.asarray(rate * delay / (1 + (rate - 1) * delay)), {"tau_ns": tau_ns}
-
-
-def shorth(values: Values) -> float:
-    """Median of the shortest half of the values.
-
-    For current amplitudes this is the single-site peak, which is the narrowest.
-
-    Examples
-    --------
-    >>> shorth(np.array([0.0, 1.0, 5.0, 5.1, 5.2, 9.0]))
-    5.1
-    """
-    ordered = np.sort(values[np.isfinite(values)])
-    half = len(ordered) // 2
-    first = int(np.argmin(ordered[half:] - ordered[: len(ordered) - half]))
-    return float(np.median(ordered[first : first + half]))
 
 
 def crossing(steps: Values, fraction: float) -> Values:

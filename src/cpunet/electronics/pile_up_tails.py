@@ -42,7 +42,7 @@ from cpunet.electronics.chain import ComplexArray, FloatArray
 from cpunet.electronics.drawn_pile_up import TailsLaw, tail_shape
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import Pulses, shortest
 from cpunet.pulses.loading import InfoPart
 from cpunet.tables import with_std
 
@@ -149,9 +149,7 @@ def mode(values: FloatArray) -> float:
     """Mode of a one-sided distribution, by repeatedly halving the shortest half."""
     ordered = np.sort(values)
     while len(ordered) > 8:
-        half = len(ordered) // 2
-        first = int(np.argmin(ordered[half:] - ordered[:-half]))
-        ordered = ordered[first : first + half + 1]
+        ordered = shortest(ordered, len(ordered) // 2 + 1)
     return float(ordered.mean())
 
 

@@ -186,3 +186,15 @@ def line_slope(n: int) -> npt.NDArray[np.float64]:
     """
     lever = np.arange(n) - (n - 1) / 2
     return np.asarray(lever / (lever @ lever))
+
+
+def shortest(ordered: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.float64]:
+    """The `n` neighbours among sorted values that lie closest together.
+
+    Examples
+    --------
+    >>> shortest(np.array([0.0, 1.0, 5.0, 5.1, 5.2, 9.0]), 3)
+    array([5. , 5.1, 5.2])
+    """
+    first = int((ordered[n - 1 :] - ordered[: len(ordered) - n + 1]).argmin())
+    return ordered[first : first + n]

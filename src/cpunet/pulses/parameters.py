@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, Pulses, blocks, line_slope
+from cpunet.pulses.container import FloatArray, Pulses, blocks, line_slope, shortest
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
 Values = npt.NDArray[np.float64]
@@ -130,6 +130,20 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
             values[unsure] = highest(current[unsure])
         amplitudes[rows] = values
     return amplitudes
+
+
+def shorth(values: Values) -> float:
+    """Median of the shortest half of the values.
+
+    For current amplitudes this is the single-site peak, which is the narrowest.
+
+    Examples
+    --------
+    >>> shorth(np.array([0.0, 1.0, 5.0, 5.1, 5.2, 9.0]))
+    5.1
+    """
+    ordered = np.sort(values[np.isfinite(values)])
+    return float(np.median(shortest(ordered, len(ordered) // 2 + 1)[:-1]))
 
 
 def current_amplitude_kernel(dt_ns: float) -> npt.NDArray[np.float32]:

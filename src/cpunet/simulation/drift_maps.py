@@ -17,7 +17,7 @@ field strength,
 from __future__ import annotations
 
 import math
-from importlib.resources import files
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -94,9 +94,8 @@ def velocity_table(
     0.081
     """
     # field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns
-    source = files("cpunet.simulation").joinpath("drift_velocity.csv")
-    with source.open(encoding="utf-8") as lines:
-        measured = np.loadtxt(lines, delimiter=",", comments=("#", "field"))
+    file = Path(__file__).with_name("drift_velocity.csv")
+    measured = np.loadtxt(file, delimiter=",", comments=("#", "field"), encoding="utf-8")
     field = measured[:, 0]
     step = float(np.gcd.reduce(np.round(field).astype(np.int64)))
     grid = np.arange(round(field[-1] / step) + 1) * step

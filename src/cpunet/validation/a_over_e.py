@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from cpunet.pulses.parameters import Values
+from cpunet.pulses.parameters import Values, shorth
 from cpunet.validation.comparisons import ByMethod, Missing, Number, Result, finite_values
 
 Range = tuple[float, float]
@@ -302,9 +302,6 @@ def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, tuple[f
     seed
         Seed of the bootstraps.
     """
-    # half of SciPy, which those who only read scores need not wait for
-    from cpunet.electronics.baseline_methods import shorth
-
     finite = {method: finite_values(values) for method, values in dep_ae.items()}
     if not all(values.size >= MIN_EVENTS for values in finite.values()):
         return {}
