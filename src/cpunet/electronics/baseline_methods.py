@@ -350,12 +350,11 @@ def fit_kernel(
         return np.asarray(np.cumsum(off, axis=1) if late else off).ravel()
 
     wanted = mean_currents([of_data[rows] for rows in slices(current)])
+    how = {"x_scale": scale, "diff_step": 1e-3, "xtol": 1e-4}
     for _ in range(FITTED_ROUNDS):
         response = scipy.fft.irfft(of_sim * transfer(s, *best), length, axis=1)
         sliced = [of_sim[rows] for rows in slices(response)]
-        best = scipy.optimize.least_squares(
-            residual, best, bounds=(0.0, high), x_scale=scale, diff_step=1e-3, xtol=1e-4
-        ).x
+        best = scipy.optimize.least_squares(residual, best, bounds=(0.0, high), **how).x
     return transfer(s, *best), dict(zip(parameters, best.tolist(), strict=True))
 
 
@@ -384,9 +383,8 @@ def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
 
     measured, data_error = mean_spectra(of_data, current)
     wiener = np.clip(1 - data_error.sum(axis=0) / (np.abs(measured) ** 2).sum(axis=0), 0, 1)
-    lead, lag, fade_in, fade_out = (
-        round(time / dt_ns) for time in (LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS)
-    )
+    times_ns = LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS
+    lead, lag, fade_in, fade_out = (round(time / dt_ns) for time in times_ns)
     phase = 0.5 * np.pi * (np.arange(lead + lag) + 0.5)
     phase = np.minimum(phase / fade_in, phase[::-1] / fade_out)
     fades = np.sin(phase.clip(max=0.5 * np.pi)) ** 2

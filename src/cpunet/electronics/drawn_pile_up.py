@@ -88,9 +88,8 @@ class TailsLaw:
 
     def draw(self, n: int, rng: np.random.Generator) -> Values:
         """Draw the tail in keV, summed over all earlier pulses, for `n` traces."""
-        row, kev, before_us = earlier_pulses(
-            n, self.rate_khz, LIFETIMES * self.decay_us, self.energies_kev, rng
-        )
+        energies, longest_us = self.energies_kev, LIFETIMES * self.decay_us
+        row, kev, before_us = earlier_pulses(n, self.rate_khz, longest_us, energies, rng)
         left = kev * np.exp(-before_us / self.decay_us)
         return np.asarray(np.bincount(row, left, minlength=n), float)
 
@@ -336,9 +335,8 @@ class InTracePileUp:
         [[0.0, 0.0, 0.25, 0.5, 0.5]]
         """
         total, time, own = np.zeros((self.n, length)), np.arange(length), len(shapes.T)
-        for row, kev, late, shape in zip(
-            self.row, self.kev, self.after_ns / dt_ns, shapes, strict=True
-        ):
+        each = zip(self.row, self.kev, self.after_ns / dt_ns, shapes, strict=True)
+        for row, kev, late, shape in each:
             moved = np.interp(time - late, np.arange(own), shape, left=0.0)
             total[row] += kev / energy_kev[row] * moved
         return total

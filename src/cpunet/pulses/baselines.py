@@ -85,10 +85,8 @@ class Baselines:
         # start of the pulse proper: all samples from there to the alignment are above threshold
         level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
         above = windows[:, : config.samples_before] >= level[:, np.newaxis]
-        start = config.samples_before - (~above[:, ::-1]).argmax(axis=1)
-        before = np.asarray(
-            prepared.align_sample - config.samples_before + start - config.samples(MARGIN_NS)
-        )
+        rise = (~above[:, ::-1]).argmax(axis=1)
+        before = np.asarray(prepared.align_sample - rise - config.samples(MARGIN_NS))
         if like is not None:
             length, stored = like.length, like.first.length
         else:

@@ -112,9 +112,8 @@ class Outcome(Generic[R]):
     @property
     def ok(self) -> bool:
         """Whether no channel failed, and no result is bad."""
-        return not self.failed and all(
-            getattr(result, "ok", True) for result in self.done.values()
-        )
+        results = self.done.values()
+        return not self.failed and all(getattr(result, "ok", True) for result in results)
 
     def __str__(self) -> str:
         lines = {name: repr(result).strip("<>'") for name, result in self.done.items()}
@@ -147,10 +146,8 @@ def each_channel(channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R])
         )
     done, failed = dict[str, R](), dict[str, str]()
     make = partial(partial, _one_channel, dict(channels), out, do)  # called in each process
-    with (
-        stage("Channels", len(channels)) as bar,
-        closing(outcomes(make, list(channels), usable_cores())) as results,
-    ):
+    made = outcomes(make, list(channels), usable_cores())
+    with stage("Channels", len(channels)) as bar, closing(made) as results:
         for name, outcome in results:
             bar.update()
             if isinstance(outcome, CpunetError):

@@ -220,10 +220,9 @@ def load_pulses(
             )
     if tell:
         rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
-        log.info(
-            f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
-            + (f" (left out: {rejected})" if rejected else "")
-        )
+        others = f" (left out: {rejected})" if rejected else ""
+        used = f"{len(prepared)} of {prepared.n_read} pulses used"
+        log.info(f"{file.path.name}: {used}{others}")
     return inputs
 
 
@@ -327,7 +326,6 @@ def _read(
         source.path,
         energies_kev=energies[np.isfinite(energies)],
         recipe=recipe,
-        cuts=None,
         read_as=file.options,
         detector=detector,
         baselines=Baselines.concatenate(baselines) if measured else None,
@@ -405,10 +403,8 @@ def _nothing_left(
     if rolled is not None and rolled.share >= FEW_ROLLED:
         return CpunetError(f"{path}: {rolled.text}", rolled.remedy)
     if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
-        return CpunetError(
-            f"{path}: the traces go down: their polarity is negative",
-            "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",
-        )
+        remedy = "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python"
+        return CpunetError(f"{path}: the traces go down: their polarity is negative", remedy)
     reasons = ", ".join(f"{n} {why}" for why, n in inputs.prepared.rejections.items())
     text = f"{path}: none of {len(codes)} pulses can be used ({reasons})"
     # of pulses of the wanted energies, if there are any, since these are what is missed
@@ -449,11 +445,9 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
     CpunetError
         If a selected line or range has pulses on one side only.
     """
+    energies = {side: side.prepared.pulses.energy_kev for side in (sim, data)}
     for part in selection.parts:
-        counts = {
-            side: int(part.select(side.prepared.pulses.energy_kev).sum())
-            for side in (sim, data)
-        }
+        counts = {side: int(part.select(kev).sum()) for side, kev in energies.items()}
         missing, other = sorted(counts, key=lambda side: counts[side])
         if not counts[other]:
             raise CpunetError(

@@ -65,9 +65,8 @@ def label_peaks(
     centres, widths = np.transpose(lines)
     # NaN is in no window, since every comparison with it is false.
     distance = np.abs(energies[:, np.newaxis] - centres)
-    nearest: npt.NDArray[np.intp] = np.where(distance <= widths, distance, np.inf).argmin(
-        axis=1
-    )
+    inside = np.where(distance <= widths, distance, np.inf)
+    nearest: npt.NDArray[np.intp] = inside.argmin(axis=1)
     return names[nearest]
 
 

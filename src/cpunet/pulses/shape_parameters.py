@@ -113,10 +113,8 @@ SHAPE_PARAMETERS: dict[str, Parameter] = {
     "drift_time": PARAMETERS["drift_time"],
     **{name: Parameter(f"t({100 * f:g} %)", "ns") for name, f in TIME_POINTS.items()},
     **{
-        name: Parameter(
-            f"Rise time {'–'.join(f'{100 * TIME_POINTS[t]:g}' for t in ends)} %", "ns"
-        )
-        for name, ends in RISE_TIMES.items()
+        f"rise_{ends}": Parameter(f"Rise time {ends.lstrip('0').replace('_', '–')} %", "ns")
+        for ends in _RISES
     },
     **{name: Parameter(name, "ns") for name in ("tp_0_est", "tp_50", "tp_90", "tp_99")},
     "rise_time": Parameter("T(10–90 %)", "ns"),
@@ -186,9 +184,8 @@ def all_parameters(
     values = {name: np.full(len(pulses), np.nan) for name in SHAPE_PARAMETERS}
     if decay_ns is None:
         finite = np.isfinite(pulses.waveforms).all(axis=1)
-        decay_ns = median_decay_ns(
-            tail_slope(pulses.waveforms[finite], dt_ns, preparation.decay_fit_samples)
-        )
+        slopes = tail_slope(pulses.waveforms[finite], dt_ns, preparation.decay_fit_samples)
+        decay_ns = median_decay_ns(slopes)
     n, aligned = preparation.baseline_samples, preparation.samples_before
     lever = np.arange(n) - (n - 1) / 2
     for rows in blocks(len(pulses), BLOCK):

@@ -233,11 +233,9 @@ def _expanded(windows: Values, extra: Values) -> Values:
     main = np.delete(plain, np.s_[LEADING : components.shape[1]], axis=1)
     i, j = np.triu_indices(main.shape[1])
     products = main[:, i] * main[:, j]
-    waves = np.column_stack(
-        [np.sin(WAVES[0] * main), *(np.cos(frequency * main) for frequency in WAVES)]
-    )
+    waves = [np.sin(WAVES[0] * main), *(np.cos(frequency * main) for frequency in WAVES)]
     parts = [plain]
-    for part in (products, waves):
+    for part in (products, np.column_stack(waves)):
         part = part - part.mean(axis=0)
         spread = part.std(axis=0)
         weight = np.sqrt(2 * main.shape[1] / part.shape[1])

@@ -56,9 +56,8 @@ def cloud_after_step(
     r = min(repulsion * slope / (size * size), _MAX_REPULSION)
     growth = d / size + r
     if growth > 0.05 or growth * step_ns > 0.1:
-        return math.sqrt(
-            2.0 * d * step_ns + (size * size * (size + 3.0 * r * step_ns)) ** (2.0 / 3.0)
-        )
+        cube = size * size * (size + 3.0 * r * step_ns)
+        return math.sqrt(2.0 * d * step_ns + cube ** (2.0 / 3.0))
     return size + growth * step_ns
 
 

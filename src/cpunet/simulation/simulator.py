@@ -122,12 +122,10 @@ class EventPulses:
 
     def pulses(self) -> Pulses:
         """Events with a signal as `Pulses`, with their collected energies."""
-        with_signal = self.collected_kev > 0
+        seen = self.collected_kev > 0
+        kev, numbers = self.collected_kev[seen], self.hits.event_number[seen]
         return Pulses.of(
-            self.waveforms[with_signal],
-            dt_ns=self.dt_ns,
-            energy_kev=self.collected_kev[with_signal],
-            event_number=self.hits.event_number[with_signal],
+            self.waveforms[seen], dt_ns=self.dt_ns, energy_kev=kev, event_number=numbers
         )
 
 

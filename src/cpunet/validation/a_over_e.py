@@ -159,13 +159,9 @@ def range_survival(
     n, n_side = len(inside), len(sides)
     passing, side_pass = (len(v) - np.searchsorted(v, cuts) for v in (inside, sides))
     p, s, total = int(passing[0]), int(side_pass[0]), n - scale * n_side
+    undefined = len(events) + len(background) - n - n_side
     result = RangeSurvival(
-        peak=n,
-        peak_pass=p,
-        sideband=n_side,
-        sideband_pass=s,
-        scale=scale,
-        undefined=len(events) + len(background) - n - n_side,
+        peak=n, peak_pass=p, sideband=n_side, sideband_pass=s, scale=scale, undefined=undefined
     )
     if not np.isfinite(cuts[0]):
         result.missing = "there is no cut: too few events of the double-escape peak"

@@ -162,10 +162,9 @@ class Comparison:
         peaks = {row.peak: [r for r in self.rows if r.peak == row.peak] for row in self.rows}
         title = f"{label(self.method)}: {len(self.reports)} runs compared"
         values = {"title": title, "comparison": self, "links": links, "peaks": peaks}
+        html = rendered("compare.html", **values, far=f"{FAR:g}")
         with written_aside(path) as aside:
-            aside.write_text(
-                rendered("compare.html", **values, far=f"{FAR:g}"), encoding="utf-8"
-            )
+            aside.write_text(html, encoding="utf-8")
 
     def __str__(self) -> str:
         lines = []
@@ -279,10 +278,8 @@ def compared(
     named = {name: of for name, (_, of) in zip(names, opened, strict=True)}
     runs = {name: report for name, report in named.items() if report is not None}
     if not runs:
-        raise CpunetError(
-            f"none of the {len(reports)} reports is there",
-            "give folders of cpunet validate or cpunet demo",
-        )
+        remedy = "give folders of cpunet validate or cpunet demo"
+        raise CpunetError(f"none of the {len(reports)} reports is there", remedy)
     made = Comparison(method, runs, tuple(name for name in named if name not in runs))
     if not made.rows:
         methods = _union(s.methods for of in runs.values() for s in of.metrics.peaks.values())

@@ -461,9 +461,8 @@ def compare(
         for name, result in results.items():
             both, axis = (data[name], by_name[name]), axes[name]
             ends = moved.get(method, {}).get(name)
-            of_method: dict[str, Any] = dict(
-                zip(("chi_square", "degrees", "p"), two_sample_test(*both, ends), strict=True)
-            )
+            chi_square, degrees, p = two_sample_test(*both, ends)
+            of_method: dict[str, Any] = {"chi_square": chi_square, "degrees": degrees, "p": p}
             of_method["shift"], of_method["shift_std"] = shift(*both, ends)
             of_method["wasserstein"] = wasserstein(*both)
             of_method["wasserstein_std"] = drawn_distances(*both, draws, NODES).std()

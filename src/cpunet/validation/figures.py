@@ -341,13 +341,9 @@ def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
             usual = np.where(data > 0, data, np.nan)
             points(below, spectrum.frequency_mhz, power / usual, error / usual, method, **look)
     below.axhline(1, color="black", linewidth=0.8)
-    silent = not any(any(spectrum.power) for spectrum in drawn.values())
-    above.set(
-        title=f"{peak}: noise before the pulse",
-        ylabel="Mean square per band\n[pulse height²]",
-        xscale="log",
-        yscale="linear" if silent else "log",
-    )
+    scale = "log" if any(any(of.power) for of in drawn.values()) else "linear"
+    above.set(title=f"{peak}: noise before the pulse", xscale="log", yscale=scale)
+    above.set_ylabel("Mean square per band\n[pulse height²]")
     above.legend()
     for axis in (above.yaxis, below.xaxis):
         axis.set_major_formatter("{x:g}")  # powers as formulas take long to set

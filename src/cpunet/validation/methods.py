@@ -123,10 +123,8 @@ def scores_of_squares(squares: Values) -> PairedScores:
     >>> round(scores_of_squares(squares["ren"]).rmse, 6)
     0.0
     """
-    rmse, edge_rmse = (
-        np.sqrt(total / count) if count else None
-        for total, count in squares.sum(axis=0).reshape(2, 2)
-    )
+    sums = squares.sum(axis=0).reshape(2, 2)
+    rmse, edge_rmse = (np.sqrt(total / count) if count else None for total, count in sums)
     unaligned = int((squares[:, 1] == 0).sum())
     return PairedScores(rmse=rmse, edge_rmse=edge_rmse, unaligned=unaligned)
 
@@ -232,12 +230,10 @@ class Translations:
     def without_noise(self, row: int) -> dict[str, FloatArray]:
         """Noise-free window of a pulse by method, with the truth if given."""
         raw, config = self.windows["raw"][[row]], self.ren.recipe.preparation
-        windows = {"raw": raw}
+        windows, kev = {"raw": raw}, self.energy_kev["raw"][[row]]
         for name, method in self.baselines.methods.items():
             windows[name] = finish(method.translate(raw), config, dt_ns=self.ren.dt_ns).windows
-        windows["ren"] = self.ren.apply(
-            raw, energy_kev=self.energy_kev["raw"][[row]], noise=False
-        )
+        windows["ren"] = self.ren.apply(raw, energy_kev=kev, noise=False)
         return windows if self.truth is None else windows | {"truth": self.truth[[row]]}
 
 
@@ -266,7 +262,8 @@ def translate_all(
     given = {} if responses is None else {"truth": responses}
     others = [*baselines.methods, *given]
     # all methods get the same noise
-    generator, *rngs = (np.random.default_rng(seed) for _ in ("ren", *others))
+    generator = np.random.default_rng(seed)
+    rngs = {name: np.random.default_rng(seed) for name in others}
 
     def finished(name: str, rows: slice, rng: np.random.Generator) -> Finished:
         method, raw = baselines.methods.get(name), pulses.waveforms[rows]
@@ -280,19 +277,16 @@ def translate_all(
     with stage("Translating", len(pulses)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         for rows in blocks(len(pulses)):
             block = pulses[rows]
-            done = [
-                pool.submit(finished, n, rows, rng) for n, rng in zip(others, rngs, strict=True)
-            ]
+            done = {n: pool.submit(finished, n, rows, rng) for n, rng in rngs.items()}
             clean = {"raw": block.waveforms}
-            for name, translated in zip(others, done, strict=True):
+            for name, translated in done.items():
                 clean[name] = translated.result().clean
                 if noise is not None:
                     noisy[name].append(translated.result().windows)
             clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
             noisy["ren"].append(like_data(ren, block, generator))
-            comparable.append(
-                np.all([np.isfinite(w).all(axis=1) for w in clean.values()], axis=0)
-            )
+            whole = [np.isfinite(windows).all(axis=1) for windows in clean.values()]
+            comparable.append(np.all(whole, axis=0))
             if responses is not None:
                 truth.append(clean.pop("truth"))
                 edge = recipe.scores.samples(recipe.scores.edge_ns)
@@ -320,9 +314,7 @@ def translate_all(
 def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> FloatArray:
     """Translated windows with noise and pile-up tails as those of the data."""
     tails = ren.tails if ren.tails is not None and ren.tails.rate_khz > 0 else None
+    kev = None if tails is None else tails.draw_kev(len(pulses), generator)
     return ren.apply(
-        pulses.waveforms,
-        energy_kev=pulses.energy_kev,
-        generator=generator,
-        tails_kev=None if tails is None else tails.draw_kev(len(pulses), generator),
+        pulses.waveforms, energy_kev=pulses.energy_kev, generator=generator, tails_kev=kev
     )

@@ -259,10 +259,8 @@ class Metrics(Result):
             aucs = np.clip((tested.auc, null, tested.null_mean), LEAST_AUC, 1 - LEAST_AUC)
             place, expected, least = ndtri(aucs) / QUANTILE_SLOPE
             if std:
-                spread = math.hypot(std, expected - least)
-                p = stdtr(
-                    SHUFFLES - 1, (expected - place) / (spread * math.sqrt(1 + 1 / SHUFFLES))
-                )
+                spread = math.hypot(std, expected - least) * math.sqrt(1 + 1 / SHUFFLES)
+                p = stdtr(SHUFFLES - 1, (expected - place) / spread)
             more, std = tested.auc - null, math.hypot(std, tested.of_fit)
             words = f"AUC {with_std(tested.auc, std)}, {null:.2f} expected"
             data = with_std(null, std)
@@ -362,9 +360,8 @@ class Metrics(Result):
                 if name not in verdicts or (p := verdicts[name].p) is None:
                     continue
                 compared = judged.get(name, Compared())
-                unit = (
-                    "%" if name == SURVIVAL else LABELLED[name].unit if name in judged else ""
-                )
+                own = LABELLED[name].unit if name in judged else ""
+                unit = "%" if name == SURVIVAL else own
                 rows.append([
                     *(peak, f"{QUANTITIES[name]} [{unit}]" if unit else QUANTITIES[name]),
                     verdicts[name].of_data,

@@ -267,9 +267,8 @@ class Report:
                 stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
                 caption = name.replace("_", " ")
                 place, _, shows = next(of for of in SECTIONS if caption.endswith(of[1]))
-                placed[place][name] = figure_html(
-                    caption, draw(), folder / f"{stem}.svg", shows
-                )
+                svg = folder / f"{stem}.svg"
+                placed[place][name] = figure_html(caption, draw(), svg, shows)
                 bar.update(1)
         # of each method that is drawn, for the page's legend
         drawn = "".join(html for of_place in placed.values() for html in of_place.values())
@@ -328,8 +327,7 @@ class Report:
         }
         shown = [m for m in methods if any(m in iou for iou in of_all.values())]
         rows = [
-            [*place, *(number(iou.get(m), ".1f") for m in shown)]
-            for place, iou in of_all.items()
+            [*key, *(number(iou.get(m), ".1f") for m in shown)] for key, iou in of_all.items()
         ]
         return ["peak", "parameter", *(_NAMES.get(m, m) for m in shown)], rows
 

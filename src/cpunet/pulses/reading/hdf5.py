@@ -167,10 +167,8 @@ def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
 
 def waveform_tables(file: h5py.File) -> list[str]:
     """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
-    folders = [
-        (broken, [path] if waveforms else []) for path, _, waveforms, broken in _folders(file)
-    ]
-    return sorted({path for broken, table in folders for path in broken or table})
+    places = [lost or ([path] if held else []) for path, _, held, lost in _folders(file)]
+    return sorted({place for some in places for place in some})
 
 
 def channel_tables(path: Path) -> list[str]:

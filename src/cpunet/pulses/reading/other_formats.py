@@ -204,17 +204,9 @@ def read_flashcam(options: PulseFile) -> PulseSource:
         return np.array([trace for trace, _ in some], np.uint16).reshape(-1, length)
 
     times = {"dt": Column.of(np.asarray(period_ns), "ns")} if period_ns > 0 else {}
-    return PulseSource(
-        path,
-        "FlashCam",
-        name,
-        None,
-        length,
-        rows,
-        times=times,
-        of_each={"event_number": numbers},
-        close=stream.close,
-    )
+    source = PulseSource(path, "FlashCam", name, None, length, rows, times=times)
+    source.of_each["event_number"], source.close = numbers, stream.close
+    return source
 
 
 def _events(

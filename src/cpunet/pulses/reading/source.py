@@ -463,12 +463,12 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         n = len(waveforms)
         of_each = {name: values[start : start + n] for name, values in self.of_each.items()}
         numbers = of_each.get("event_number", np.arange(start, start + n))
-        energy_kev = of_each.get("energy_kev")
-        if energy_kev is None and self.kev_per_adc is not None:
-            energy_kev = self.kev_per_adc * amplitude(waveforms)
-        if energy_kev is not None and len(energy_kev) != n:
+        kev, t0_ns = of_each.get("energy_kev"), of_each.get("t0_ns", 0.0)
+        if kev is None and self.kev_per_adc is not None:
+            kev = self.kev_per_adc * amplitude(waveforms)
+        if kev is not None and len(kev) != n:
             raise CpunetError(
-                f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
+                f"{self.path}: event {numbers[len(kev)]} has no energy; "
                 "give the energies of the same events"
             )
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
@@ -482,9 +482,5 @@ class PulseSource(AbstractContextManager["PulseSource"]):
                 "split the file by sampling period"
             )
         return Pulses.of(
-            waveforms,
-            dt_ns=self.dt_ns,
-            energy_kev=energy_kev,
-            event_number=event_number,
-            t0_ns=of_each.get("t0_ns", 0.0),
+            waveforms, dt_ns=self.dt_ns, energy_kev=kev, event_number=event_number, t0_ns=t0_ns
         )
