@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import Pulses, Rows
 from cpunet.pulses.preparation import FloatColumn, Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
@@ -19,8 +18,6 @@ SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those
 STORED_SHARE = 0.5  # the same for those stored, since those of some traces may be longer
 # Threshold of the start of a pulse, and time before it in which the pulse may already rise.
 START_FRACTION, START_SIGMAS, MARGIN_NS = 0.01, 8.0, 960.0
-
-Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,7 +75,7 @@ class Baselines:
         raw: Pulses,
         prepared: Prepared,
         config: PreparationConfig,
-        like: Baselines | None = None,
+        like: Self | None = None,
     ) -> Self:
         """Baselines of some traces, raw and prepared, as long as those of the first ones."""
         config, windows = config.at(prepared.pulses.dt_ns), prepared.pulses.waveforms

@@ -161,10 +161,8 @@ def each_channel(channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R])
     )
 
 
-def _one_channel(
-    channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R], name: str
-) -> R:
-    pair = channels[name]
+def _one_channel(pairs: Pairs, out: Path, do: Callable[[str, Pair, Path], R], name: str) -> R:
+    pair = pairs[name]
     if isinstance(pair, CpunetError):
         raise pair
     log.info(f"{name}:")

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FloatArray = npt.NDArray[np.float32]
-Which = slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]  # of some pulses
+Rows = npt.NDArray[np.int64]
+Which = slice | npt.NDArray[np.bool_] | Rows  # of some pulses
 
 BLOCK = 512  # pulses at a time, to bound memory
 

@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses import provenance
-from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.baselines import TRACES, WHOLE, Baselines
+from cpunet.pulses.container import FloatArray, Pulses, Rows
 from cpunet.pulses.peaks import EnergySelection, label_peaks, suggested_calibration
 from cpunet.pulses.preparation import (
     Codes,

@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,9 +22,9 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, line_slope
 from cpunet.pulses.parameters import Values, tail_slope
-from cpunet.pulses.peaks import label_peaks, suggested_calibration
+from cpunet.pulses.peaks import Peaks, label_peaks, suggested_calibration
 from cpunet.pulses.reading.source import PulseSource, amplitude
-from cpunet.recipes.schema import PeakConfig, PreparationConfig, Recipe
+from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.settings import flat
 from cpunet.tables import counted, span
 
@@ -251,9 +251,7 @@ def left_out(whole: Pulses, recipe: Recipe) -> str:
     return f"{counted(prepared.rejections) or 'none'} of {len(whole)} traces"
 
 
-def describe_pulses(
-    source: PulseSource, blocks: Iterable[Pulses], peaks: Mapping[str, PeakConfig]
-) -> Words:
+def describe_pulses(source: PulseSource, blocks: Iterable[Pulses], peaks: Peaks) -> Words:
     """Describe the pulses of one table, by names and texts.
 
     The file is read in blocks; only energies or amplitudes of all pulses are held in memory.

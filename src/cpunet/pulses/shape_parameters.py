@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import hist
 import numpy as np
+from hist.axis import Regular
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, blocks
@@ -230,7 +231,7 @@ MAX_BINS = 49
 FENCE = 3.0
 
 
-def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
+def data_axis(data: Values, max_bins: int) -> Regular:
     r"""Binning of a parameter from its measured values alone.
 
     The axis spans the data within three interquartile ranges (IQR) of the quartiles, with
@@ -275,12 +276,10 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
     # The last edge is exclusive, but a maximum inside the fence is not an overflow: after
     # rounding, (maximum - low) / (last edge - low) must be less than 1.
     margin = 4 * np.spacing(max(abs(low), abs(high)))
-    return hist.axis.Regular(bins, low, high + margin)
+    return Regular(bins, low, high + margin)
 
 
-def labelled(
-    axis: hist.axis.Regular, parameter: str, bins: int | None = None
-) -> hist.axis.Regular:
+def labelled(axis: Regular, parameter: str, bins: int | None = None) -> Regular:
     """The same range, in so many bins if given, with the parameter's name and label.
 
     Raises
@@ -292,7 +291,7 @@ def labelled(
         raise CpunetError(f"`bins` is {bins}", "give 1 or more")
     low, *_, high = axis.edges
     label = LABELLED[parameter].axis_label
-    return hist.axis.Regular(bins or axis.size, low, high, name=parameter, label=label)
+    return Regular(bins or axis.size, low, high, name=parameter, label=label)
 
 
 class Histogram(hist.Hist[Any], family=hist):

@@ -110,6 +110,8 @@ def smear_and_sample(
         out[j] += weight * total
 
 
+Place = tuple[float, float, float]  # x, y, z in mm
+
 # A carrier is collected once its signal can change by less than this fraction of full scale.
 _COLLECTED = 5e-5
 # Holes that move slowly along the edge of the contact also count as collected.
@@ -120,7 +122,7 @@ _AT_CONTACT, _CREEPING = 0.999, 2e-4
 def drift(
     maps: DriftMaps,
     carrier: int,
-    start: tuple[float, float, float],
+    start: Place,
     step_ns: float,
     stride: int,
     cloud: tuple[float, float, float],
@@ -229,12 +231,7 @@ def _arrived(carrier: int, wp: float, rise: float, potential: float, bias_V: flo
 
 
 @kernel(inline="always")
-def _moved(
-    maps: DriftMaps,
-    carrier: int,
-    here: tuple[float, float, float],
-    step: tuple[float, float, float],
-) -> tuple[float, float, float]:
+def _moved(maps: DriftMaps, carrier: int, here: Place, step: Place) -> Place:
     """Place after a step. Charges slide along the passivated face, holes along the ditch."""
     x, y, z = here[0] + step[0], here[1] + step[1], max(here[2] + step[2], 0.0)
     p = math.sqrt(x * x + y * y) * maps.per_mm

@@ -79,13 +79,11 @@ def make_grid(detector: Detector) -> Grid:
     return Grid(r_mm=r, z_mm=z, grid_mm=h, region=region, r_steps=r_steps, z_steps=z_steps)
 
 
-def _steps(
-    detector: Detector, rr: FloatArray, zz: FloatArray, region: RegionArray
-) -> FloatArray:
+def _steps(detector: Detector, r: FloatArray, z: FloatArray, region: RegionArray) -> FloatArray:
     """Fractions of the steps along the first axis that lie outside the contacts."""
     contact = region <= LI_CONTACT
     crossing = contact[:-1] != contact[1:]
-    nodes = np.stack([rr, zz])
+    nodes = np.stack([r, z])
     low, high = nodes[:, :-1][:, crossing], nodes[:, 1:][:, crossing]
     # start at the node outside the contact
     start, end = np.where(contact[:-1][crossing], [high, low], [low, high])

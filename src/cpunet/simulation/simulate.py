@@ -19,12 +19,11 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.outputs import refuse_inputs
 from cpunet.processes import usable_cores
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.peaks import Peaks, parse_selection
 from cpunet.pulses.provenance import MADE_BY, SIMULATION
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import PeakConfig
 from cpunet.settings import Set, require_seed
 from cpunet.simulation.gammas import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
@@ -50,7 +49,7 @@ _STRAY, _MISPLACED = 1e-3, 0.9
 
 
 def energy_windows(
-    names: str | Iterable[str], peaks: Mapping[str, PeakConfig], half_width_kev: float
+    names: str | Iterable[str], peaks: Peaks, half_width_kev: float
 ) -> list[EnergyWindow]:
     """Windows from ``"FEP,DEP"`` or ranges in keV such as ``"1500-1580"``.
 
@@ -70,6 +69,7 @@ def energy_windows(
 
     Examples
     --------
+    >>> from cpunet.recipes.schema import PeakConfig
     >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
     >>> [tuple(window) for window in energy_windows("FEP,1500-1580", lines, 0.5)]
     [('FEP', 2614.0, 2615.0), ('1500-1580', 1500.0, 1580.0)]
@@ -86,7 +86,7 @@ def energy_windows(
 
 
 def wanted_events(
-    events: str | Mapping[str, int], peaks: Mapping[str, PeakConfig], half_width_kev: float
+    events: str | Mapping[str, int], peaks: Peaks, half_width_kev: float
 ) -> dict[EnergyWindow, int]:
     """Windows, and the events wanted in each.
 
@@ -104,6 +104,7 @@ def wanted_events(
 
     Examples
     --------
+    >>> from cpunet.recipes.schema import PeakConfig
     >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
     >>> list(wanted_events("FEP=10,1500-1580=5", lines, 0.5).values())
     [10, 5]

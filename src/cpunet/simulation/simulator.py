@@ -397,11 +397,7 @@ def _sum_events(
 
 @kernel
 def _merge(
-    position: FloatArray,
-    energy: FloatArray,
-    offsets: IntArray,
-    alone: BoolArray,
-    distance2: float,
+    position: FloatArray, energy: FloatArray, offsets: IntArray, alone: BoolArray, near2: float
 ) -> tuple[FloatArray, IntArray]:
     """Clusters as rows (x, y, z, energy), and the offsets of the events."""
     merged = np.zeros((len(energy), 4))
@@ -427,7 +423,7 @@ def _merge(
                     square = 0.0
                     for axis in range(3):
                         square += (position[mine, axis] - position[other, axis]) ** 2
-                    if square <= distance2:
+                    if square <= near2:
                         label[other] = n
                         queue[waiting] = other
                         waiting += 1

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -239,10 +239,7 @@ def compare(
 
 
 def compared(
-    reports: Sequence[str | Path | Report],
-    *,
-    method: str = "ren",
-    failed: Collection[Path] = (),
+    reports: Sequence[str | Path | Report], *, method: str = "ren", failed: Sequence[Path] = ()
 ) -> Comparison:
     """Compare the scores of several validations, see `compare`.
 

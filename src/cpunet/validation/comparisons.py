@@ -21,9 +21,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any
 
-import hist
 import numpy as np
 import numpy.typing as npt
+from hist.axis import Regular
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cpunet.pulses.parameters import Values
@@ -269,9 +269,7 @@ def drawn_distances(a: Values, b: Values, draws: Sequence[Resampled], nodes: int
     return np.asarray(np.diff(positions) @ heights)
 
 
-def histogram(
-    values: Values, axis: hist.axis.Regular, drawn: Resampled | None = None
-) -> Histogram:
+def histogram(values: Values, axis: Regular, drawn: Resampled | None = None) -> Histogram:
     """Counts of all values: underflow, the bins, overflow, and the NaNs last.
 
     Parameters
@@ -286,7 +284,7 @@ def histogram(
     Examples
     --------
     >>> import numpy as np
-    >>> axis = hist.axis.Regular(2, 0, 2)
+    >>> axis = Regular(2, 0, 2)
     >>> histogram(np.array([-1, 0.5, 1.5, 1.6, np.inf, np.nan]), axis)
     array([1., 1., 2., 1., 1.])
     """
@@ -436,7 +434,7 @@ def compare(
     sizes = {m: len(next(iter(values.values()))) for m, values in methods.items()}
     n_sim = max(sizes.values(), default=0)
     null = [Resampled(n_data, n, scores.bootstraps, rng) for n in (n_sim, n_data)]
-    axes: dict[str, hist.axis.Regular | None] = {}
+    axes: dict[str, Regular | None] = {}
     results: dict[str, dict[str, Any]] = {}
     for name, values in data.items():
         distances = drawn_distances(values, values, null, NULL_NODES)

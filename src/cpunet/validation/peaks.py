@@ -34,8 +34,7 @@ import numpy as np
 
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
-from cpunet.pulses.baselines import Rows
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, Rows
 from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters

@@ -128,13 +128,11 @@ def validate(
     return Outcome({n: Report.load(place) for n, place in outcome.done.items()}, outcome.failed)
 
 
-def _of_channel(
-    runs: RunLike, how: dict[str, Any], name: str, pair: Pair, folder: Path
-) -> Path:
+def _of_channel(runs: RunLike, how: dict[str, Any], name: str, pair: Pair, out: Path) -> Path:
     """The folder of the report of a channel, made in a process of its own."""
     run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-    _validated(used_run(run), pair, folder, **how)
-    return folder
+    _validated(used_run(run), pair, out, **how)
+    return out
 
 
 def _validated(

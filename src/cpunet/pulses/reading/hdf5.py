@@ -11,7 +11,7 @@ import logging
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TypeAlias, TypeGuard
 
 import h5py
 import numpy as np
@@ -27,7 +27,8 @@ from cpunet.tables import shortened
 _PREFERRED = ("waveform", "waveform_windowed")
 log = logging.getLogger(__name__)
 
-_Folder = tuple[str, dict[str, h5py.Group | h5py.Dataset], list[str], list[str]]
+Item: TypeAlias = h5py.Group | h5py.Dataset
+_Folder = tuple[str, dict[str, Item], list[str], list[str]]
 
 # plain datasets, in order of preference
 _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
@@ -73,9 +74,7 @@ def read_hdf5(options: PulseFile) -> PulseSource:
         )  # fmt: skip
 
 
-def _traces(
-    item: h5py.Group | h5py.Dataset, length: int | None, start: int, stop: int
-) -> npt.NDArray[Any]:
+def _traces(item: Item, length: int | None, start: int, stop: int) -> npt.NDArray[Any]:
     """Rows of traces; vectors of their own lengths are continued to `length` samples."""
     plain = isinstance(item, h5py.Dataset)
     values = item[start:stop] if plain else h5.lh5_rows(item, start, stop - start)
@@ -200,7 +199,7 @@ def _folders(
     if (info.fileno, info.addr) in seen:
         return
     seen.add((info.fileno, info.addr))
-    items, broken = dict[str, h5py.Group | h5py.Dataset](), list[str]()
+    items, broken = dict[str, Item](), list[str]()
     for name in group:
         try:
             items[name] = h5.item_at(group, name)

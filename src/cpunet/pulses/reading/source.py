@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import Pulses, Rows
 from cpunet.tables import shortened
 from cpunet.units import factor, unit_names
 
@@ -102,14 +102,14 @@ class Column:
         """All values, which are read when they are asked for."""
         return self.load()
 
-    def at(self, rows: npt.NDArray[np.int64], n: int | None) -> Column:
+    def at(self, rows: Rows, n: int | None) -> Column:
         """The values of some of `n` rows; a number for all stays."""
         if self.size != n:
             return self
         return Column(lambda: self.values[rows], len(rows), self.units)
 
 
-def some_of(read: Read, rows: npt.NDArray[np.int64], start: int, stop: int) -> Values:
+def some_of(read: Read, rows: Rows, start: int, stop: int) -> Values:
     """Rows of a first to one before a last of those chosen, never more at once than these."""
     wanted, parts = rows[start:stop], list[Values]()
     while len(wanted):
@@ -167,9 +167,7 @@ def labels(columns: Mapping[str, Values], names: Iterable[str]) -> Texts:
     return np.asarray(reduce(lambda label, part: add(add(label, ","), part), parts), np.str_)
 
 
-def parts(
-    columns: Mapping[str, Column], rows: npt.NDArray[np.int64]
-) -> tuple[list[str], list[str]]:
+def parts(columns: Mapping[str, Column], rows: Rows) -> tuple[list[str], list[str]]:
     """The columns that part some rows, see `dividing`, and the labels of the parts."""
     of = {name: np.atleast_1d(c.values)[rows] for name, c in columns.items() if divides(name)}
     names = dividing(of, len(rows))
@@ -264,7 +262,7 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     of_each: dict[str, Any] = field(default_factory=dict)
     group: h5py.Group | None = None
     close: Callable[[], None] = lambda: None
-    chosen: npt.NDArray[np.int64] | None = field(default=None, init=False)
+    chosen: Rows | None = field(default=None, init=False)
     n_all: int | None = field(default=None, init=False)
     dt_ns: float = field(default=np.nan, init=False)
     energies: str = field(default="", init=False)
