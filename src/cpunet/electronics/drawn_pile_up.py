@@ -292,11 +292,8 @@ class InTracePileUp:
         order = np.argsort(self.kev, kind="stable")  # the largest is written last
         kev[self.row[order]] = self.kev[order]
         after_ns[self.row[order]] = self.after_ns[order]
-        return {
-            "n_piled": (np.bincount(self.row, minlength=self.n), ""),
-            "piled_kev": (kev, "keV"),
-            "piled_ns": (after_ns, "ns"),
-        }
+        n = np.bincount(self.row, minlength=self.n)
+        return {"n_piled": (n, ""), "piled_kev": (kev, "keV"), "piled_ns": (after_ns, "ns")}
 
     def reach(self, dt_ns: float) -> int:
         """Number of samples beyond a record that `added` needs for the earliest pulse."""

@@ -206,10 +206,8 @@ class TailsInfo(InfoPart):
         )
         rate = f"{with_std(self.rate_khz, self.rate_error_khz)} kHz"
         by = f"estimated from {self.told_by}, error {self.error_kev:.2g} keV"
-        return [
-            ("pile-up tails", f"{rate}, decaying with {self.decay_us:.3g} µs"),
-            ("", f"{shares} ({by})"),
-        ]
+        rate += f", decaying with {self.decay_us:.3g} µs"
+        return [("pile-up tails", rate), ("", f"{shares} ({by})")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -372,13 +370,11 @@ class PileUpTails:
         """Summary: the rate, its error, and fractions of traces above several thresholds."""
         law, surely = self.fit.law, self.law is not None
         measured = self.kev[np.isfinite(self.kev)]
-        percent = {
-            f"{kev:g}_kev": {
-                "measured": round(100 * float((measured > kev).mean()), 2),
-                "law": round(100 * float(law.share_above(kev)), 2) if surely else 0.0,
-            }
-            for kev in SHARES_KEV
-        }
+        percent = {}
+        for kev in SHARES_KEV:
+            shares = (measured > kev).mean(), law.share_above(kev) if surely else 0.0
+            seen, by_law = (round(100 * float(share), 2) for share in shares)
+            percent[f"{kev:g}_kev"] = {"measured": seen, "law": by_law}
         return TailsInfo(
             rate_khz=law.rate_khz if surely else 0.0,
             rate_error_khz=self.fit.rate_error_khz,

@@ -377,14 +377,13 @@ def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     finite = np.isfinite(waveforms).all(axis=1)
     top = np.where(finite, waveforms.argmax(axis=1), 0)
     height = waveforms[np.arange(len(waveforms)), top]
-    # the last sample before the maximum that is below its half, -1 without any
+    # the last sample before the maximum that is below its half
     below = waveforms < 0.5 * height[:, np.newaxis]
     below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
     last = waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
-    before = np.where(below.any(axis=1), last, -1)
-    if not (usable := finite & (height > 0) & (before >= 0)).any():
+    if not (usable := finite & (height > 0) & below.any(axis=1)).any():
         return moved
-    pulses, before = waveforms[usable], before[usable]
+    pulses, before = waveforms[usable], last[usable]
     padded = np.pad(pulses.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
     coefficients = spline_filter1d(padded, order=3, axis=1)
     level = 0.5 * pulses.max(axis=1).astype(float)

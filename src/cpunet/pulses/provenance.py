@@ -36,10 +36,8 @@ log = logging.getLogger(__name__)
 Words = list[tuple[str, str]]
 
 # attributes of a table, and of a file
-SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
-    "side", "made_by", "translated_by", "run", "simulation",
-)  # fmt: skip
-TRANSLATION = "cpunet_translation"
+SIDE, MADE_BY, TRANSLATED_BY = "side", "made_by", "translated_by"
+RUN, SIMULATION, TRANSLATION = "run", "simulation", "cpunet_translation"
 REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
 _NETWORKS = {REN: "REN", IREN: "IREN"}
 
@@ -234,10 +232,8 @@ def trace_properties(whole: Pulses, config: PreparationConfig) -> Words:
     slopes = tail_slope(windows - baselines, whole.dt_ns, config.decay_fit_samples)
     slopes = slopes[np.isfinite(slopes)]
     slope = float(np.median(slopes)) / 1e3 if len(slopes) >= MIN_NUMBER else 0.0  # in 1/µs
-    return [
-        ("decay", f"{-1 / slope:.3g} µs" if slope < 0 else "the tails do not decay"),
-        ("noise", f"{noise} (RMS of a baseline, median)"),
-    ]
+    decay = f"{-1 / slope:.3g} µs" if slope < 0 else "the tails do not decay"
+    return [("decay", decay), ("noise", f"{noise} (RMS of a baseline, median)")]
 
 
 def left_out(whole: Pulses, recipe: Recipe) -> str:

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, blocks
+from cpunet.pulses.container import FloatArray, Rows, blocks
 from cpunet.pulses.parameters import Values
 
 Parameters = Mapping[str, Values]
@@ -111,16 +111,12 @@ def classifier_auc(
     CpunetError
         If a side has fewer than 40 pulses with only finite values.
     """
-    sides = (data, others)
-    extras = [
-        np.column_stack([np.empty((len(windows), 0)), *values.values()])
-        for windows, values in zip(sides, features or ({}, {}), strict=True)
-    ]
-    rng = np.random.default_rng(seed)
-    usable = [
-        np.flatnonzero(np.isfinite(windows).all(axis=1) & np.isfinite(extra).all(axis=1))
-        for windows, extra in zip(sides, extras, strict=True)
-    ]
+    sides, rng = (data, others), np.random.default_rng(seed)
+    extras, usable = list[Values](), list[Rows]()
+    for side, values in zip(sides, features or ({}, {}), strict=True):
+        extras.append(np.column_stack([np.empty((len(side), 0)), *values.values()]))
+        finite = np.isfinite(side).all(axis=1) & np.isfinite(extras[-1]).all(axis=1)
+        usable.append(np.flatnonzero(finite))
     if same_events:
         usable = [np.intersect1d(usable[0], usable[1])] * 2
     size = min(LARGEST, *map(len, usable))

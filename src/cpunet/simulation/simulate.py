@@ -236,16 +236,14 @@ class GammaSource:
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
 
         def events_of(i: int) -> tuple[Hits, int]:
-            wanted = {
-                w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()
-            }
+            share = {w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()}
             return simulate_gammas(
                 detector,
                 source_height_mm=self.height_mm,
                 source_radius_mm=self.radius_mm,
-                n_primaries=_GAMMAS_PER_EVENT * sum(wanted.values()),
+                n_primaries=_GAMMAS_PER_EVENT * sum(share.values()),
                 seed=int(seeds[i]),
-                wanted=wanted,
+                wanted=share,
             )
 
         at_once, primaries = min(usable_cores(), _MAX_WORKERS, rounds), 0
@@ -403,10 +401,8 @@ def simulate(
         for before_merging, block in simulator.blocks(opened, f"Simulating {crystal.name}"):
             simulation.count(before_merging, block)
             seen = block.collected_kev > 0
-            columns: dict[str, tuple[Any, str]] = {
-                "lost_energy": (block.lost_kev[seen], "keV"),
-                "n_hits": (np.diff(block.hits.offsets)[seen], ""),
-            }
+            columns: dict[str, tuple[Any, str]] = {"lost_energy": (block.lost_kev[seen], "keV")}
+            columns["n_hits"] = np.diff(block.hits.offsets)[seen], ""
             if physics.electron_trapping_per_us or physics.hole_trapping_per_us:
                 columns["trapped_energy"] = (block.trapped_kev[seen], "keV")
             writer.append(block.pulses(), columns)

@@ -285,8 +285,8 @@ def translate_all(
                     noisy[name].append(translated.result().windows)
             clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
             noisy["ren"].append(like_data(ren, block, generator))
-            whole = [np.isfinite(windows).all(axis=1) for windows in clean.values()]
-            comparable.append(np.all(whole, axis=0))
+            finite = [np.isfinite(windows).all(axis=1) for windows in clean.values()]
+            comparable.append(np.all(finite, axis=0))
             if responses is not None:
                 truth.append(clean.pop("truth"))
                 edge = recipe.scores.samples(recipe.scores.edge_ns)
@@ -298,17 +298,12 @@ def translate_all(
     for name in (*baselines.methods, "ren", "truth"):  # from the simplest to the truth
         if name in noisy:
             every[name] = np.concatenate(noisy.pop(name))
-    return Translations(
-        ren,
-        baselines,
-        every,
-        {m: np.asarray(np.isfinite(windows).all(axis=1)) for m, windows in every.items()},
-        {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every},
-        {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()},
-        np.concatenate(comparable),
-        {method: np.concatenate(of_method) for method, of_method in squares.items()},
-        np.concatenate(truth) if truth else None,
-    )
+    whole = {m: np.asarray(np.isfinite(w).all(axis=1)) for m, w in every.items()}
+    kev = {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every}
+    amplitudes = {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()}
+    of_pairs = {method: np.concatenate(of_method) for method, of_method in squares.items()}
+    of_all, shapes = np.concatenate(comparable), np.concatenate(truth) if truth else None
+    return Translations(ren, baselines, every, whole, kev, amplitudes, of_all, of_pairs, shapes)
 
 
 def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> FloatArray:

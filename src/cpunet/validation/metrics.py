@@ -214,16 +214,11 @@ class Metrics(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """What the file has: the numbers, and verdicts in words."""
-        table = {
-            peak: {
-                method: {
-                    quantity: {key: getattr(v, key) for key in WRITTEN}
-                    for quantity, v in self.judge(peak, method).items()
-                }
-                for method in scores.methods
-            }
-            for peak, scores in self.peaks.items()
-        }
+        table: dict[str, dict[str, Any]] = {peak: {} for peak in self.peaks}
+        for peak, scores in self.peaks.items():
+            for method in scores.methods:
+                own = self.judge(peak, method).items()
+                table[peak][method] = {q: {k: getattr(v, k) for k in WRITTEN} for q, v in own}
         words = {"summary": [self.summary(peak) for peak in self.scored], "table": table}
         return {**self.model_dump(mode="json", exclude_unset=True), "verdicts": words}
 

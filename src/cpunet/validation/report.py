@@ -326,9 +326,7 @@ class Report:
             for parameter, compared in scores.parameters.items()
         }
         shown = [m for m in methods if any(m in iou for iou in of_all.values())]
-        rows = [
-            [*key, *(number(iou.get(m), ".1f") for m in shown)] for key, iou in of_all.items()
-        ]
+        rows = [[*k, *(number(iou.get(m), ".1f") for m in shown)] for k, iou in of_all.items()]
         return ["peak", "parameter", *(_NAMES.get(m, m) for m in shown)], rows
 
 
