@@ -71,28 +71,24 @@ class Baselines:
 
     @classmethod
     def of_block(
-        cls,
-        raw: Pulses,
-        prepared: Prepared,
-        config: PreparationConfig,
-        like: Self | None = None,
+        cls, raw: Pulses, ready: Prepared, config: PreparationConfig, like: Self | None = None
     ) -> Self:
         """Baselines of some traces, raw and prepared, as long as those of the first ones."""
-        config, windows = config.at(prepared.pulses.dt_ns), prepared.pulses.waveforms
+        config, windows = config.at(ready.pulses.dt_ns), ready.pulses.waveforms
         # start of the pulse proper: all samples from there to the alignment are above threshold
-        level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
+        level = np.maximum(START_FRACTION, START_SIGMAS * ready.baseline_rms)
         above = windows[:, : config.samples_before] >= level[:, np.newaxis]
         rise = (~above[:, ::-1]).argmax(axis=1)
-        before = np.asarray(prepared.align_sample - rise - config.samples(MARGIN_NS))
+        before = np.asarray(ready.align_sample - rise - config.samples(MARGIN_NS))
         if like is not None:
             length, stored = like.length, like.first.length
         else:
             shares = np.quantile(before if len(before) else [0], (SHORTEST_SHARE, STORED_SHARE))
             length, stored = (max(int(samples), 0) for samples in shares)
         first = raw.with_waveforms(raw.waveforms[:, :stored].copy())
-        no_windows = prepared.pulses.with_waveforms(windows[:, :0].copy())
-        height = windows.max(axis=1) * prepared.scale
-        return cls(first, replace(prepared, pulses=no_windows), before, height, length)
+        no_windows = ready.pulses.with_waveforms(windows[:, :0].copy())
+        height = windows.max(axis=1) * ready.scale
+        return cls(first, replace(ready, pulses=no_windows), before, height, length)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Baselines]) -> Self:

@@ -72,10 +72,8 @@ def channels_of(file: PulseFile) -> dict[str, PulseFile]:
     energy = file.energy or ""
     places = {replace(file, table=table).place for table in tables}  # rows of one share it
     if ":" in energy and CHANNEL not in energy and len(places) > 1:
-        raise CpunetError(
-            f"{energy}: one column for {len(places)} channels; put {CHANNEL} into its path, as "
-            f"in hit.lh5:{CHANNEL}/hit/energy"
-        )
+        remedy = f"put {CHANNEL} into its path, as in hit.lh5:{CHANNEL}/hit/energy"
+        raise CpunetError(f"{energy}: one column for {len(places)} channels", remedy)
     return {
         name: replace(file, table=table, energy=energy.replace(CHANNEL, name) or None)
         for name, table in channel_names(tables).items()
@@ -140,10 +138,8 @@ def each_channel(channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R])
         If `out` is the output of one channel.
     """
     if out.is_file() or (out / MARKER).exists():
-        raise CpunetError(
-            f"{out}: is the output of one channel; choose another `out` for the folders of "
-            f"{len(channels)}"
-        )
+        remedy = f"choose another `out` for the folders of {len(channels)}"
+        raise CpunetError(f"{out}: is the output of one channel", remedy)
     done, failed = dict[str, R](), dict[str, str]()
     make = partial(partial, _one_channel, dict(channels), out, do)  # called in each process
     made = outcomes(make, list(channels), usable_cores())

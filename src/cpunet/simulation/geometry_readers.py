@@ -229,10 +229,8 @@ def detector_values(
     """
     source, kind = f"detector {name}", diode.get("type")
     if kind is not None and kind not in _SIMULATED:  # semi-coaxial ones collect on their bore
-        raise CpunetError(
-            f"{source}: type {reprlib.repr(kind)} is not simulated; "
-            f"give one of type {', '.join(_SIMULATED)}"
-        )
+        remedy = f"give one of type {', '.join(_SIMULATED)}"
+        raise CpunetError(f"{source}: type {reprlib.repr(kind)} is not simulated", remedy)
     geometry = dict(flat(diode["geometry"]))
     cracked = any(key.startswith("extra.crack.") for key in geometry)
     if cracked and geometry.get("extra.crack.width_in_mm") != 0:

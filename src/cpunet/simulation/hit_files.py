@@ -66,10 +66,8 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
                 f"{file}: holds detectors {names}; choose one with `hits_detector`"
             )
         if chosen is not None and not names:
-            raise CpunetError(
-                f"{file}: its hits name no detector to pick {chosen} by; leave out "
-                "`hits_detector`"
-            )
+            remedy = "leave out `hits_detector`"
+            raise CpunetError(f"{file}: its hits name no detector to pick {chosen} by", remedy)
         if chosen is not None and chosen not in detectors:
             raise CpunetError(f"{file}: no detector {chosen}; it holds {names}")
         return detectors[chosen or next(iter(detectors))].hits(options)

@@ -353,7 +353,5 @@ def recognise(path: Path) -> str:
     for start, (program, remedy) in _FOREIGN.items():
         if re.match(start, head):
             raise CpunetError(f"{path}: is a {program} file, which is not read", remedy)
-    raise CpunetError(
-        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, or "
-        "pickled pulses"
-    )
+    remedy = "give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, or pickled pulses"
+    raise CpunetError(f"{path}: of no known format", remedy)

@@ -465,10 +465,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         if kev is None and self.kev_per_adc is not None:
             kev = self.kev_per_adc * amplitude(waveforms)
         if kev is not None and len(kev) != n:
-            raise CpunetError(
-                f"{self.path}: event {numbers[len(kev)]} has no energy; "
-                "give the energies of the same events"
-            )
+            remedy = "give the energies of the same events"
+            raise CpunetError(f"{self.path}: event {numbers[len(kev)]} has no energy", remedy)
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
         periods = of_each.get("dt_ns", np.full(n, self.dt_ns))
         other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
