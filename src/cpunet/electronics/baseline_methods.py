@@ -252,10 +252,8 @@ def slices(current: Values) -> list[npt.NDArray[np.int64]]:
     rise = crossing(steps, RISE_END) - crossing(steps, RISE_START)
     rows = np.flatnonzero(np.isfinite(rise))
     if len(rows) < 2 * SLICES / SINGLE_SITE:
-        raise CpunetError(
-            f"only {len(rows)} of {len(current)} pulses rise from baseline to top; "
-            "check that they are prepared charge pulses"
-        )
+        text = f"only {len(rows)} of {len(current)} pulses rise from baseline to top"
+        raise CpunetError(text, "check that they are prepared charge pulses")
     # Over three samples, the peak hardly depends on the sampling phase.
     height = (current[:, :-2] + current[:, 1:-1] + current[:, 2:]).max(axis=1)
     ordered = rows[np.argsort(rise[rows], kind="stable")]

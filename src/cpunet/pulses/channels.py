@@ -65,10 +65,8 @@ def channels_of(file: PulseFile) -> dict[str, PulseFile]:
     """
     tables = [*table_sizes(file.path)]
     if not tables:
-        raise CpunetError(
-            f"{file.path}: holds no tables of waveforms of which to take all; leave out "
-            f"`data_table` {ALL} or `table` {ALL}"
-        )
+        text = f"{file.path}: holds no tables of waveforms of which to take all"
+        raise CpunetError(text, f"leave out `data_table` {ALL} or `table` {ALL}")
     energy = file.energy or ""
     places = {replace(file, table=table).place for table in tables}  # rows of one share it
     if ":" in energy and CHANNEL not in energy and len(places) > 1:

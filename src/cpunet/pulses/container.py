@@ -166,10 +166,9 @@ def _numbers(values: npt.ArrayLike, kind: type[np.floating[Any]], name: str) -> 
             values = np.ma.filled(values.astype(kind), np.nan)
         return np.asarray(values, kind)
     except (ValueError, TypeError) as error:  # of awkward as of NumPy
-        raise CpunetError(
-            f"{name}: no plain numbers ({str(error).splitlines()[0][:100]})",
-            "give rows of equal length, and NaN for what is missing",
-        ) from error
+        remedy = "give rows of equal length, and NaN for what is missing"
+        why = str(error).splitlines()[0][:100]
+        raise CpunetError(f"{name}: no plain numbers ({why})", remedy) from error
 
 
 def blocks(n: int, size: int = BLOCK) -> Iterator[slice]:

@@ -320,16 +320,11 @@ def _read(
     detector: str | None = None
     with suppress(ValueError, LookupError, TypeError):  # other programs may have such a name
         detector = str(json.loads(source.attrs[provenance.SIMULATION])["detector"]["name"])
-    inputs = InputSet(
-        _joined(sets),
-        source.dt_ns,
-        source.path,
-        energies_kev=energies[np.isfinite(energies)],
-        recipe=recipe,
-        read_as=file.options,
-        detector=detector,
-        baselines=Baselines.concatenate(baselines) if measured else None,
-        counts=counts,
+    joined, finite = _joined(sets), energies[np.isfinite(energies)]
+    inputs = InputSet(joined, source.dt_ns, source.path, energies_kev=finite, recipe=recipe)
+    stored = Baselines.concatenate(baselines) if measured else None
+    inputs = replace(
+        inputs, read_as=file.options, detector=detector, baselines=stored, counts=counts
     )
     if not n:
         raise _nothing_left(inputs, selection, first, heights)
@@ -450,16 +445,12 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
         counts = {side: int(part.select(kev).sum()) for side, kev in energies.items()}
         missing, other = sorted(counts, key=lambda side: counts[side])
         if not counts[other]:
-            raise CpunetError(
-                f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be used",
-                "leave it out of `peak`",
-            )
+            neither = f"neither has a pulse of {part.name} that can be used"
+            raise CpunetError(f"{sim.path}, {data.path}: {neither}", "leave it out of `peak`")
         if not counts[missing]:
-            raise CpunetError(
-                f"{missing.path}: no pulse of {part.name} can be used, {other.path.name} has "
-                f"{counts[other]}",
-                "leave it out of `peak`, or give a file that has them",
-            )
+            others = f"{other.path.name} has {counts[other]}"
+            text = f"{missing.path}: no pulse of {part.name} can be used, {others}"
+            raise CpunetError(text, "leave it out of `peak`, or give a file that has them")
     lines = selection.lines_in_ranges
     if not lines:
         return []
@@ -470,8 +461,6 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
 def require_same_sampling(sim: InputSet, data: InputSet) -> None:
     """Raise a `CpunetError` if the two sides differ in their sampling period."""
     if not np.isclose(sim.dt_ns, data.dt_ns):
-        raise CpunetError(
-            f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {data.path} every "
-            f"{data.dt_ns:g} ns",
-            "resample one of them, or give `dt_ns` if one says it wrongly",
-        )
+        other = f"{data.path} every {data.dt_ns:g} ns"
+        text = f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {other}"
+        raise CpunetError(text, "resample one of them, or give `dt_ns` if one says it wrongly")

@@ -178,10 +178,8 @@ def all_parameters(
     """
     dt_ns, preparation = pulses.dt_ns, preparation.at(pulses.dt_ns)
     if pulses.length != preparation.length:
-        raise CpunetError(
-            f"the pulses have {pulses.length} samples and prepared ones "
-            f"{preparation.length}; prepare them first"
-        )
+        text = f"the pulses have {pulses.length} samples and prepared ones {preparation.length}"
+        raise CpunetError(text, "prepare them first")
     values = {name: np.full(len(pulses), np.nan) for name in SHAPE_PARAMETERS}
     if decay_ns is None:
         finite = np.isfinite(pulses.waveforms).all(axis=1)

@@ -244,10 +244,8 @@ def detector_values(
         if key == "extra" or key.startswith("extra.crack"):
             continue
         if key not in _KEYS["diode"]:
-            raise CpunetError(
-                f"{source}: unknown key geometry.{key} (units belong to the key); "
-                "correct or remove it"
-            )
+            text = f"{source}: unknown key geometry.{key} (units belong to the key)"
+            raise CpunetError(text, "correct or remove it")
         values[_KEYS["diode"][key]] = value
     values.pop("", None)
     radii = [f"geometry.groove.radius_in_mm.{side}" for side in ("outer", "inner")]
@@ -258,10 +256,8 @@ def detector_values(
         reasons[field] = f"neither {' nor '.join(places)} is above 0"
         numbers = [_number_at(diode, place, source, 0.0) for place in places]
         if min(numbers) < 0:
-            raise CpunetError(
-                f"{source}: {places[numbers.index(min(numbers))]} is below 0",
-                "correct it, or write 0 for none",
-            )
+            text = f"{source}: {places[numbers.index(min(numbers))]} is below 0"
+            raise CpunetError(text, "correct it, or write 0 for none")
         if any(numbers):
             values[field] = next(filter(None, numbers))
     boule, cut = values["name"][:-1], values["name"][-1:]  # V99000 and A of V99000A

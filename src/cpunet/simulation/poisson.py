@@ -66,10 +66,8 @@ def make_grid(detector: Detector) -> Grid:
     h, sizes = detector.grid_mm, (detector.crystal_radius, detector.crystal_length)
     nr, nz = (int(np.ceil(size / h - 1e-6)) + 1 for size in sizes)
     if nr * nz > MAX_NODES:
-        raise CpunetError(
-            f"detector {detector.name}: grid_mm {h:g} makes {nr} x {nz} nodes; "
-            f"give a coarser one (at most {MAX_NODES} nodes)"
-        )
+        text = f"detector {detector.name}: grid_mm {h:g} makes {nr} x {nz} nodes"
+        raise CpunetError(text, f"give a coarser one (at most {MAX_NODES} nodes)")
     # rounded, so that 23 steps of 0.1 mm are exactly 2.3 mm
     r, z = (np.round(np.arange(n) * h, 9) for n in (nr, nz))
     rr, zz = np.meshgrid(r, z, indexing="ij")

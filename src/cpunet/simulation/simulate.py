@@ -234,16 +234,13 @@ class GammaSource:
         Each round has its own seed, so the events do not depend on the number of cores.
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
+        place = {"source_height_mm": self.height_mm, "source_radius_mm": self.radius_mm}
 
         def events_of(i: int) -> tuple[Hits, int]:
             share = {w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()}
+            most = _GAMMAS_PER_EVENT * sum(share.values())
             return simulate_gammas(
-                detector,
-                source_height_mm=self.height_mm,
-                source_radius_mm=self.radius_mm,
-                n_primaries=_GAMMAS_PER_EVENT * sum(share.values()),
-                seed=int(seeds[i]),
-                wanted=share,
+                detector, n_primaries=most, seed=int(seeds[i]), wanted=share, **place
             )
 
         at_once, primaries = min(usable_cores(), _MAX_WORKERS, rounds), 0
@@ -459,10 +456,8 @@ class StoredSimulation:
         with opened(file) as content:
             text = content[_PULSES].attrs.get("simulation") if _PULSES in content else None
             if text is None or HIT_TABLE not in content:
-                raise CpunetError(
-                    f"{file}: no {_PULSES} with its simulation, or no {HIT_TABLE}; give "
-                    "an output of cpunet simulate or of a test stand"
-                )
+                wrong = f"{file}: no {_PULSES} with its simulation, or no {HIT_TABLE}"
+                raise CpunetError(wrong, "give an output of cpunet simulate or of a test stand")
             numbers = np.asarray(content[f"{_PULSES}/event_number"][()])
         try:
             made = json.loads(text)

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
+from numpy.typing import ArrayLike, NDArray
 
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
@@ -108,7 +108,7 @@ class EventPulses:
         Energy in keV of each event that gives a signal, which is what a detector measures.
     """
 
-    waveforms: npt.NDArray[np.float32]
+    waveforms: NDArray[np.float32]
     dt_ns: float
     hits: Hits
     valid: BoolArray
@@ -233,11 +233,7 @@ class Simulator:
         )
 
     def signals(
-        self,
-        x_mm: npt.ArrayLike,
-        y_mm: npt.ArrayLike,
-        z_mm: npt.ArrayLike,
-        edep_kev: npt.ArrayLike,
+        self, x_mm: ArrayLike, y_mm: ArrayLike, z_mm: ArrayLike, edep_kev: ArrayLike
     ) -> EventPulses:
         """Pulse of each hit, in units of its charge.
 
@@ -313,7 +309,7 @@ class Simulator:
                 bar.update(len(hits))
 
     def paths(
-        self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike
+        self, x_mm: ArrayLike, y_mm: ArrayLike, z_mm: ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
         """Trajectories of both carriers from each starting point in mm.
 
@@ -342,7 +338,7 @@ def _sum_events(
     offsets: IntArray,
     task: Task,
     weighted: bool,
-    waveforms: npt.NDArray[np.float32],
+    waveforms: NDArray[np.float32],
     facts: FloatArray,
 ) -> None:
     """Fill the pulses of events, and the facts of hits with a signal.

@@ -253,13 +253,8 @@ class Report:
         metrics = self.metrics
         text = json.dumps(self.to_dict(), indent=2, allow_nan=False, ensure_ascii=False)
         (folder / METRICS).write_text(text + "\n", encoding="utf-8")
-        parameters = {
-            f"{peak}/{method}/{name}": of_method[name]
-            for peak, of_peak in self.values.items()
-            for method, of_method in of_peak.items()
-            for name in of_method
-        }
-        np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
+        arrays: dict[str, Any] = dict(flat(self.values, "/"))
+        np.savez_compressed(folder / VALUES, allow_pickle=False, **arrays)
 
         placed: dict[str, dict[str, Markup]] = {place: {} for place, _, _ in SECTIONS}
         with stage("Drawing", len(self.drawn)) as bar:

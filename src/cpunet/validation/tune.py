@@ -113,10 +113,8 @@ def tune(
     storage = JournalStorage(JournalFileBackend(str(out / JOURNAL)))
     study = optuna.create_study(study_name="cpunet", storage=storage, load_if_exists=True)
     for difference in differences(study.user_attrs.get(BEGUN, begun), begun):
-        raise CpunetError(
-            f"{out}: was begun with other settings or pulses: {difference}; give the same, or "
-            "choose another name"
-        )
+        text = f"{out}: was begun with other settings or pulses: {difference}"
+        raise CpunetError(text, "give the same, or choose another name")
     study.set_user_attr(BEGUN, begun)
     if own and not study.trials:
         study.enqueue_trial(own)
@@ -228,10 +226,7 @@ class HeldOut:
         values = pulse_parameters(held[1], job.recipe.preparation, job.recipe.scores)
         rng, sizes = np.random.default_rng(job.seed), [len(pulses) for pulses in held]
         draws = [Resampled(sizes[1], n, job.recipe.scores.bootstraps, rng) for n in sizes]
-        nulls = {
-            name: float(drawn_distances(v, v, draws, NULL_NODES).mean())
-            for name, v in values.items()
-        }
+        nulls = {k: drawn_distances(v, v, draws, NULL_NODES).mean() for k, v in values.items()}
         return cls(job, held[0], held[1], values, nulls)
 
     def score(self, ren: REN) -> float:

@@ -269,10 +269,8 @@ def column_elsewhere(source: PulseSource, column: str) -> Column:
         return theirs
     _, at, of = np.intersect1d(events, others, return_indices=True)
     if not len(at) or any(len(np.unique(keys)) < len(keys) for keys in (events, others)):
-        raise CpunetError(
-            f"{source.path}: {column} is of other events than these pulses ({key})",
-            "give the energies of the same events",
-        )
+        text = f"{source.path}: {column} is of other events than these pulses ({key})"
+        raise CpunetError(text, "give the energies of the same events")
     log.info(
         f"{source.path.name}: {column} is in another order or of other events; joined by "
         f"{key}, {len(events) - len(at)} of {len(events)} pulses have no energy there"

@@ -197,10 +197,8 @@ def whole_numbers(values: Values, where: str, start: int = 0) -> npt.NDArray[np.
         bad = ~((numbers == np.rint(numbers)) & (np.abs(numbers) < _MAX_NUMBER))
         if bad.any():
             row = int(bad.argmax())
-            raise CpunetError(
-                f"{where}: row {start + row}: {values[row]} is no number of an event; number "
-                "the events anew"
-            )
+            text = f"{where}: row {start + row}: {values[row]} is no number of an event"
+            raise CpunetError(text, "number the events anew")
     return values.astype(np.int64)
 
 
@@ -278,16 +276,12 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         """
         n, sizes = self.n_pulses, {column.size for column in self.columns.values()}
         if n == 0 or self.length == 0:
-            raise CpunetError(
-                f"{self.path}: {self.name or self.format} holds no pulses; "
-                "give a file with events"
-            )
+            text = f"{self.path}: {self.name or self.format} holds no pulses"
+            raise CpunetError(text, "give a file with events")
         if self.length in sizes and n not in sizes:  # as Julia and MATLAB write arrays
-            raise CpunetError(
-                f"{self.path}: traces of shape {(n, self.length)} with columns of "
-                f"{self.length}: their dimensions are reversed",
-                "write them transposed, with the pulses first",
-            )
+            text = f"traces of shape {(n, self.length)} with columns of {self.length}"
+            remedy = "write them transposed, with the pulses first"
+            raise CpunetError(f"{self.path}: {text}: their dimensions are reversed", remedy)
         if n is not None:
             self._choose(file.rows, n)
         self._sample(file.dt_ns)
@@ -303,10 +297,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         """Values of a column, which must be as many as there are traces, or one for all."""
         values, n = column.values, self.n_pulses
         if n is not None and values.shape not in ((), (n,)):
-            raise CpunetError(
-                f"{self.path}: column {name} has {len(values)} values for {n} waveforms; "
-                "give the column of the same events"
-            )
+            text = f"{self.path}: column {name} has {len(values)} values for {n} waveforms"
+            raise CpunetError(text, "give the column of the same events")
         return np.atleast_1d(values) if n is None else np.broadcast_to(values, (n,))
 
     def _choose(self, wanted: Mapping[str, str], n: int) -> None:
@@ -366,10 +358,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         self.dt_ns = period = float(periods.flat[0])
         is_period = np.isfinite(period) and period > 0
         if dt_ns is None and not is_period:
-            raise CpunetError(
-                f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns",
-                "give `dt_ns`",
-            )
+            text = f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns"
+            raise CpunetError(text, "give `dt_ns`")
         if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
             log.warning(
                 f"{self.path.name}: says that it is sampled every {period:g} ns; taken as "
@@ -421,10 +411,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             self.energies = f"not known (column {name} is not in energy units)"
         else:
             units = f"in {column.units}" if column.units else "without units"
-            raise CpunetError(
-                f"{self.path}: column {name} is {units}, no energy in keV; "
-                "add `kev_per_adc` (1 if it is in keV)"
-            )
+            text = f"{self.path}: column {name} is {units}, no energy in keV"
+            raise CpunetError(text, "add `kev_per_adc` (1 if it is in keV)")
 
     def __exit__(self, *error: object) -> None:
         self.close()
@@ -447,10 +435,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
         if (energies := len(self.of_each.get("energy_kev", range(start)))) != start:
-            raise CpunetError(
-                f"{self.path}: {start} waveforms, but {energies} energies; "
-                "give the energies of the same events"
-            )
+            text = f"{self.path}: {start} waveforms, but {energies} energies"
+            raise CpunetError(text, "give the energies of the same events")
 
     def read(self, start: int = 0, stop: int | None = None) -> Pulses:
         """Read all pulses of the file, or some rows, at once; they must fit in memory."""
