@@ -257,10 +257,8 @@ def slices(current: Values) -> list[npt.NDArray[np.int64]]:
     # Over three samples, the peak hardly depends on the sampling phase.
     height = (current[:, :-2] + current[:, 1:-1] + current[:, 2:]).max(axis=1)
     ordered = rows[np.argsort(rise[rows], kind="stable")]
-    return [
-        group[np.argsort(height[group])[-int(np.ceil(SINGLE_SITE * len(group))) :]]
-        for group in np.array_split(ordered, SLICES)
-    ]
+    groups = np.array_split(ordered, SLICES)
+    return [g[np.argsort(height[g])[-int(np.ceil(SINGLE_SITE * len(g))) :]] for g in groups]
 
 
 def aligned(spectra: Spectrum, response: Values) -> Spectrum:

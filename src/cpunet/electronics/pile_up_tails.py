@@ -200,10 +200,8 @@ class TailsInfo(InfoPart):
         """Names and texts."""
         if not self.rate_khz:
             return [("pile-up tails", "none significant")]
-        shares = ", ".join(
-            f"{share['law']:.2g} % above {size.partition('_')[0]} keV"
-            for size, share in self.percent_above.items()
-        )
+        above = {size.partition("_")[0]: of["law"] for size, of in self.percent_above.items()}
+        shares = ", ".join(f"{share:.2g} % above {kev} keV" for kev, share in above.items())
         rate = f"{with_std(self.rate_khz, self.rate_error_khz)} kHz"
         by = f"estimated from {self.told_by}, error {self.error_kev:.2g} keV"
         rate += f", decaying with {self.decay_us:.3g} µs"

@@ -71,9 +71,8 @@ class Pulses:
 
     def __post_init__(self) -> None:
         if self.waveforms.ndim != 2:
-            raise CpunetError(
-                f"waveforms have shape {self.waveforms.shape}; expected (pulses, samples)"
-            )
+            shape = self.waveforms.shape
+            raise CpunetError(f"waveforms have shape {shape}; expected (pulses, samples)")
         n = len(self.waveforms)
         for name in _PER_PULSE[1:]:
             shape = getattr(self, name).shape
@@ -151,10 +150,8 @@ class Pulses:
         first = sets[0]
         for other in sets[1:]:
             if (other.length, other.dt_ns) != (first.length, first.dt_ns):
-                raise CpunetError(
-                    f"cannot join {other.length} samples of {other.dt_ns} ns "
-                    f"to {first.length} samples of {first.dt_ns} ns"
-                )
+                both = [f"{of.length} samples of {of.dt_ns} ns" for of in (other, first)]
+                raise CpunetError(f"cannot join {both[0]} to {both[1]}")
         joined = {n: np.concatenate([getattr(s, n) for s in sets]) for n in _PER_PULSE}
         return Pulses(dt_ns=first.dt_ns, **joined)
 

@@ -214,10 +214,8 @@ def load_pulses(
     elif tell:
         ends = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
         if np.median(ends) < MIN_SIMULATED_END:
-            log.warning(
-                f"{file.path.name}: these pulses decay; "
-                "are they simulated ones, without electronics?"
-            )
+            question = "are they simulated ones, without electronics?"
+            log.warning(f"{file.path.name}: these pulses decay; {question}")
     if tell:
         rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
         others = f" (left out: {rejected})" if rejected else ""

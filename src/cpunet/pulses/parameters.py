@@ -363,10 +363,8 @@ def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> Fl
 def require_pulses(waveforms: FloatArray, shortest: int) -> None:
     """Raise a `CpunetError` unless an array has the shape (pulses, samples)."""
     if waveforms.ndim != 2 or waveforms.shape[1] < shortest:
-        raise CpunetError(
-            f"waveforms have shape {waveforms.shape}; "
-            f"expected (pulses, samples) with {shortest} samples or more"
-        )
+        expected = f"expected (pulses, samples) with {shortest} samples or more"
+        raise CpunetError(f"waveforms have shape {waveforms.shape}; {expected}")
 
 
 def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:

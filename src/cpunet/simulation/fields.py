@@ -186,10 +186,8 @@ def scaled_to_depletion(detector: Detector) -> Detector:
             f"times its impurities none depletes at {measured:g} V; correct "
             "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
         )
-    log.info(
-        f"{detector.name}: impurities times {low:.4g}, so that it depletes at the measured "
-        f"{measured:g} V"
-    )
+    voltage = f"the measured {measured:g} V"
+    log.info(f"{detector.name}: impurities times {low:.4g}, so that it depletes at {voltage}")
     return detector.model_copy(update={"impurity_scale": low})
 
 

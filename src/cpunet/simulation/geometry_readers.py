@@ -314,10 +314,8 @@ def impurity_values(
         raise CpunetError(f"{source}: no impurity_curve; {_ANOTHER}")
     model, models = curve.get("model"), _KEYS["impurity_curve"]
     if not isinstance(model, str) or model not in models:
-        raise CpunetError(
-            f"{source}: impurity_curve.model {model!r} is unknown; models are "
-            f"{', '.join(models)}; {_ANOTHER}"
-        )
+        text = f"{source}: impurity_curve.model {model!r} is unknown"
+        raise CpunetError(f"{text}; models are {', '.join(models)}", _ANOTHER)
     numbers = dict.fromkeys("abcn", 0.0)
     for key in models[model]:
         value = _number_at(crystal, f"impurity_curve.parameters.{key}", source)

@@ -280,10 +280,8 @@ def compared(
     made = Comparison(method, runs, tuple(name for name in named if name not in runs))
     if not made.rows:
         methods = _union(s.methods for of in runs.values() for s in of.metrics.peaks.values())
-        raise CpunetError(
-            f"{', '.join(runs)}: no score of the method {method}; "
-            + (f"there are {', '.join(methods)}" if methods else "nothing is scored there")
-        )
+        others = f"there are {', '.join(methods)}" if methods else "nothing is scored there"
+        raise CpunetError(f"{', '.join(runs)}: no score of the method {method}; {others}")
     return made
 
 

@@ -59,10 +59,8 @@ def read_hdf5(options: PulseFile) -> PulseSource:
             lengths = np.diff(np.asarray(sized[:], np.int64), prepend=0)
             length = int(lengths.max())
             if lengths.min() < length:
-                log.info(
-                    f"{path.name}: pulses of {lengths.min()} to {length} samples are "
-                    "continued with their last value"
-                )
+                span = f"{lengths.min()} to {length} samples"
+                log.info(f"{path.name}: pulses of {span} are continued with their last value")
 
         def rows(start: int, stop: int) -> npt.NDArray[Any]:
             with h5.one_line(path):

@@ -102,11 +102,8 @@ def read_numpy(options: PulseFile) -> PulseSource:
     usual = [name for name in _WAVEFORMS if name in matrices and options.place is None]
     name = options.chosen_of(usual or matrices, "array", "arrays of two dimensions")
     numbers = {n: v for n, v in arrays.items() if v.dtype.kind in "iufb" and n != name}
-    columns = {
-        column: Column.of(values.ravel() if values.ndim else values)
-        for column, values in numbers.items()
-        if values.ndim <= 1 or 1 in values.shape
-    }
+    numbers = {n: v for n, v in numbers.items() if v.ndim <= 1 or 1 in v.shape}
+    columns = {n: Column.of(v.ravel() if v.ndim else v) for n, v in numbers.items()}
     return _of_array(options.path, "NumPy", name, arrays[name], columns)
 
 

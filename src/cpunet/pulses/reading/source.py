@@ -361,10 +361,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             text = f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns"
             raise CpunetError(text, "give `dt_ns`")
         if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
-            log.warning(
-                f"{self.path.name}: says that it is sampled every {period:g} ns; taken as "
-                f"{dt_ns:g} ns, as given (`dt_ns`)"
-            )
+            text = f"says that it is sampled every {period:g} ns; taken as {dt_ns:g} ns"
+            log.warning(f"{self.path.name}: {text}, as given (`dt_ns`)")
             self.dt_ns = dt_ns
         if column.size > 1 and is_period:  # a single value applies to all events
             self.of_each["dt_ns"] = periods * (self.dt_ns / period)
@@ -390,17 +388,13 @@ class PulseSource(AbstractContextManager["PulseSource"]):
 
             column = hdf5.column_elsewhere(self, name)
         if column is None:
-            raise CpunetError(
-                f"{self.path}: no column {name} for the energy; there are "
-                f"{shortened(self.columns)}"
-            )
+            text = f"no column {name} for the energy; there are {shortened(self.columns)}"
+            raise CpunetError(f"{self.path}: {text}")
         units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
         by, rule = factor(units, "keV"), f"column {name} [{units}]"
         if by is not None and kev_per_adc is not None:
-            log.warning(
-                f"{self.path.name}: column {name} is in {units}; its energies are "
-                f"multiplied by {kev_per_adc:g}, as given (`kev_per_adc`)"
-            )
+            text = f"is in {units}; its energies are multiplied by {kev_per_adc:g}"
+            log.warning(f"{self.path.name}: column {name} {text}, as given (`kev_per_adc`)")
             by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
         elif kev_per_adc is not None:
             by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
