@@ -17,7 +17,8 @@ if TYPE_CHECKING:
 
 FloatArray = npt.NDArray[np.float32]
 Rows = npt.NDArray[np.int64]
-Which = slice | npt.NDArray[np.bool_] | Rows  # of some pulses
+Flags = npt.NDArray[np.bool_]
+Which = slice | Flags | Rows  # of some pulses
 
 BLOCK = 512  # pulses at a time, to bound memory
 

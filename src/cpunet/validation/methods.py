@@ -28,12 +28,11 @@ from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.progress import stage
-from cpunet.pulses.container import FloatArray, Pulses, blocks
+from cpunet.pulses.container import Flags, FloatArray, Pulses, blocks
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
 from cpunet.pulses.reading.other_formats import read_arrays
-from cpunet.simulation.geometry import BoolArray
 from cpunet.translation.translator import REN
 from cpunet.validation.metrics import PairedScores
 
@@ -220,10 +219,10 @@ class Translations:
     ren: REN
     baselines: FittedBaselineMethods
     windows: dict[str, FloatArray]
-    whole: dict[str, BoolArray]
+    whole: dict[str, Flags]
     energy_kev: dict[str, Values]
     amplitudes: dict[str, Values]
-    comparable: BoolArray
+    comparable: Flags
     squares: dict[str, Values]
     truth: FloatArray | None
 
@@ -272,7 +271,7 @@ def translate_all(
         return finish(records, config, dt_ns=ren.dt_ns, noise=noise, energy_kev=kev, seed=rng)
 
     noisy, squares = (defaultdict[str, list[Any]](list) for _ in range(2))
-    comparable: list[BoolArray] = []
+    comparable: list[Flags] = []
     truth: list[FloatArray] = []
     with stage("Translating", len(pulses)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         for rows in blocks(len(pulses)):
