@@ -396,8 +396,10 @@ def _nothing_left(
     if rolled is not None and rolled.share >= FEW_ROLLED:
         return CpunetError(f"{path}: {rolled.text}", rolled.remedy)
     if np.mean(amplitude(-traces) > 2 * np.maximum(amplitude(traces), 0)) > 0.5:
-        remedy = "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python"
-        return CpunetError(f"{path}: the traces go down: their polarity is negative", remedy)
+        return CpunetError(
+            f"{path}: the traces go down: their polarity is negative",
+            "invert them, as by pulses.with_waveforms(-pulses.waveforms) in Python",
+        )
     reasons = ", ".join(f"{n} {why}" for why, n in inputs.prepared.rejections.items())
     text = f"{path}: none of {len(codes)} pulses can be used ({reasons})"
     # of pulses of the wanted energies, if there are any, since these are what is missed
@@ -459,6 +461,8 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
 def require_same_sampling(sim: InputSet, data: InputSet) -> None:
     """Raise a `CpunetError` if the two sides differ in their sampling period."""
     if not np.isclose(sim.dt_ns, data.dt_ns):
-        other = f"{data.path} every {data.dt_ns:g} ns"
-        text = f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {other}"
-        raise CpunetError(text, "resample one of them, or give `dt_ns` if one says it wrongly")
+        raise CpunetError(
+            f"{sim.path}: sampled every {sim.dt_ns:g} ns, but {data.path} every "
+            f"{data.dt_ns:g} ns",
+            "resample one of them, or give `dt_ns` if one says it wrongly",
+        )

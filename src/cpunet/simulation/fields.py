@@ -147,8 +147,10 @@ def compute_fields(detector: Detector) -> FieldMaps:
                 f"detector {detector.name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
                 "check impurity_z0_1e10_per_cm3 and impurity_gradient_1e10_per_cm4"
             )
-        text = f"detector {detector.name}: bias_V = {bias:g} does not deplete it"
-        raise CpunetError(text, f"give at least the depletion voltage, {np.ceil(needed):.0f} V")
+        raise CpunetError(
+            f"detector {detector.name}: bias_V = {bias:g} does not deplete it; "
+            f"give at least the depletion voltage, {np.ceil(needed):.0f} V"
+        )
     # without a charge or a plane below it, the field has no component normal to the face z = 0
     mirror = not (detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
     e_r, e_z = electric_field(volts, parts, mirror=mirror)

@@ -353,5 +353,7 @@ def recognise(path: Path) -> str:
     for start, (program, remedy) in _FOREIGN.items():
         if re.match(start, head):
             raise CpunetError(f"{path}: is a {program} file, which is not read", remedy)
-    remedy = "give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, or pickled pulses"
-    raise CpunetError(f"{path}: of no known format", remedy)
+    raise CpunetError(
+        f"{path}: of no known format; give LH5, HDF5, FlashCam .fcio, NumPy .npz or .npy, or "
+        "pickled pulses"
+    )

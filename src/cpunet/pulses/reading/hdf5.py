@@ -130,8 +130,10 @@ def choose_waveforms(path: Path, file: h5py.File, table: str | None) -> str:
     if len(tables) > 1 or best is None:
         several = tables if len(tables) > 1 else columns
         what = "tables of waveforms" if len(tables) > 1 else "waveform columns"
-        remedy = "choose one with `table` (`sim_table`, `data_table`)"
-        raise CpunetError(f"{path}: {len(several)} {what} ({shortened(several)})", remedy)
+        raise CpunetError(
+            f"{path}: {len(several)} {what} ({shortened(several)}); choose one with `table` "
+            "(`sim_table`, `data_table`)"
+        )
     others = ", ".join(sorted(names.keys() - {best}))
     log.info(f"{path.name}: {best} is read, at the full rate, not {others} (`table`)")
     return names[best]

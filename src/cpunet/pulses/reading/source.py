@@ -405,8 +405,10 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             self.energies = f"not known (column {name} is not in energy units)"
         else:
             units = f"in {column.units}" if column.units else "without units"
-            text = f"{self.path}: column {name} is {units}, no energy in keV"
-            raise CpunetError(text, "add `kev_per_adc` (1 if it is in keV)")
+            raise CpunetError(
+                f"{self.path}: column {name} is {units}, no energy in keV; "
+                "add `kev_per_adc` (1 if it is in keV)"
+            )
 
     def __exit__(self, *error: object) -> None:
         self.close()
