@@ -121,11 +121,9 @@ def classifier_auc(
         usable = [np.intersect1d(usable[0], usable[1])] * 2
     size = min(LARGEST, *map(len, usable))
     if size < MIN_PULSES:
-        raise CpunetError(
-            f"{len(usable[0])} measured and {len(usable[1])} simulated pulses are usable, "
-            f"and {size} of each would be compared; a two-sample test needs {MIN_PULSES} "
-            "of each"
-        )
+        both = f"{len(usable[0])} measured and {len(usable[1])} simulated pulses are usable"
+        needed = f"a two-sample test needs {MIN_PULSES} of each"
+        raise CpunetError(f"{both}, and {size} of each would be compared; {needed}")
     rows = [np.sort(rng.choice(own, size, replace=False)) for own in usable]
     if same_events:
         rows[1] = rows[0]

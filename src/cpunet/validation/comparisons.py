@@ -438,11 +438,9 @@ def compare(
     results: dict[str, dict[str, Any]] = {}
     for name, values in data.items():
         distances = drawn_distances(values, values, null, NULL_NODES)
-        result = results[name] = {
-            "wasserstein_null": distances.mean(),
-            "wasserstein_null_std": distances.std(),
-            "missing": {"data": int(np.isnan(values).sum())},
-        }
+        result = results[name] = {"missing": {"data": int(np.isnan(values).sum())}}
+        result["wasserstein_null"] = distances.mean()
+        result["wasserstein_null_std"] = distances.std()
         ceilings, finite, axis = np.full(1, np.nan), finite_values(values), None
         if finite.size:
             axis = data_axis(values, scores.max_bins)

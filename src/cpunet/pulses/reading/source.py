@@ -454,11 +454,9 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
         if other.any():
             first = int(other.argmax())
-            raise CpunetError(
-                f"{self.path}: event {event_number[first]}: sampling period "
-                f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
-                "split the file by sampling period"
-            )
+            text = f"sampling period {periods[first]:g} ns, before it {self.dt_ns:g} ns"
+            remedy = "split the file by sampling period"
+            raise CpunetError(f"{self.path}: event {event_number[first]}: {text}", remedy)
         return Pulses.of(
             waveforms, dt_ns=self.dt_ns, energy_kev=kev, event_number=event_number, t0_ns=t0_ns
         )
