@@ -18,10 +18,10 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.kernels import kernel
-from cpunet.simulation.drift import FWHM_PER_SIGMA, REPULSION_PER_KEV, cloud_after_step
+from cpunet.simulation.drift import FWHM_PER_SIGMA, cloud_after_step
 from cpunet.simulation.drift_maps import HOLE, carrier_velocity, velocity_table
 from cpunet.simulation.hits import Hits
-from cpunet.simulation.simulator import merge_hits
+from cpunet.simulation.simulator import REPULSION_PER_KEV, merge_hits
 
 Values = npt.NDArray[np.float64]
 ENERGIES_KEV = (100, 200, 400, 700, 1000, 1400, 2000)

@@ -35,7 +35,7 @@ from cpunet.electronics.chain import FloatArray as Values
 from cpunet.electronics.finishing import padding, record_length
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, blocks
-from cpunet.pulses.parameters import crossings, current_amplitude, tail_slope
+from cpunet.pulses.parameters import crossings, current_amplitude, shorth, tail_slope
 
 MIN_PULSES = 50  # of either dataset, for a fit
 TAIL_SHARE = 0.75  # of the time after the alignment: 4.8 of 6.4 us, as in the paper
@@ -218,22 +218,6 @@ def fit_rc(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
     return np.asarray(rate * delay / (1 + (rate - 1) * delay)), {"tau_ns": tau_ns}
 
 
-def shorth(values: Values) -> float:
-    """Median of the shortest half of the values.
-
-    For current amplitudes this is the single-site peak, which is the narrowest.
-
-    Examples
-    --------
-    >>> shorth(np.array([0.0, 1.0, 5.0, 5.1, 5.2, 9.0]))
-    5.1
-    """
-    ordered = np.sort(values[np.isfinite(values)])
-    half = len(ordered) // 2
-    first = int(np.argmin(ordered[half:] - ordered[: len(ordered) - half]))
-    return float(np.median(ordered[first : first + half]))
-
-
 def crossing(steps: Values, fraction: float) -> Values:
     """Sample at which each pulse of unit height last rises through a fraction.
 
@@ -268,17 +252,13 @@ def slices(current: Values) -> list[npt.NDArray[np.int64]]:
     rise = crossing(steps, RISE_END) - crossing(steps, RISE_START)
     rows = np.flatnonzero(np.isfinite(rise))
     if len(rows) < 2 * SLICES / SINGLE_SITE:
-        raise CpunetError(
-            f"only {len(rows)} of {len(current)} pulses rise from baseline to top; "
-            "check that they are prepared charge pulses"
-        )
+        text = f"only {len(rows)} of {len(current)} pulses rise from baseline to top"
+        raise CpunetError(text, "check that they are prepared charge pulses")
     # Over three samples, the peak hardly depends on the sampling phase.
     height = (current[:, :-2] + current[:, 1:-1] + current[:, 2:]).max(axis=1)
     ordered = rows[np.argsort(rise[rows], kind="stable")]
-    return [
-        group[np.argsort(height[group])[-int(np.ceil(SINGLE_SITE * len(group))) :]]
-        for group in np.array_split(ordered, SLICES)
-    ]
+    groups = np.array_split(ordered, SLICES)
+    return [g[np.argsort(height[g])[-int(np.ceil(SINGLE_SITE * len(g))) :]] for g in groups]
 
 
 def aligned(spectra: Spectrum, response: Values) -> Spectrum:
@@ -366,12 +346,11 @@ def fit_kernel(
         return np.asarray(np.cumsum(off, axis=1) if late else off).ravel()
 
     wanted = mean_currents([of_data[rows] for rows in slices(current)])
+    how = {"x_scale": scale, "diff_step": 1e-3, "xtol": 1e-4}
     for _ in range(FITTED_ROUNDS):
         response = scipy.fft.irfft(of_sim * transfer(s, *best), length, axis=1)
         sliced = [of_sim[rows] for rows in slices(response)]
-        best = scipy.optimize.least_squares(
-            residual, best, bounds=(0.0, high), x_scale=scale, diff_step=1e-3, xtol=1e-4
-        ).x
+        best = scipy.optimize.least_squares(residual, best, bounds=(0.0, high), **how).x
     return transfer(s, *best), dict(zip(parameters, best.tolist(), strict=True))
 
 
@@ -400,9 +379,8 @@ def fit_superpulse(sim: FloatArray, steps: FloatArray, dt_ns: float) -> Kernel:
 
     measured, data_error = mean_spectra(of_data, current)
     wiener = np.clip(1 - data_error.sum(axis=0) / (np.abs(measured) ** 2).sum(axis=0), 0, 1)
-    lead, lag, fade_in, fade_out = (
-        round(time / dt_ns) for time in (LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS)
-    )
+    times_ns = LEAD_NS, LAG_NS, FADE_IN_NS, FADE_OUT_NS
+    lead, lag, fade_in, fade_out = (round(time / dt_ns) for time in times_ns)
     phase = 0.5 * np.pi * (np.arange(lead + lag) + 0.5)
     phase = np.minimum(phase / fade_in, phase[::-1] / fade_out)
     fades = np.sin(phase.clip(max=0.5 * np.pi)) ** 2

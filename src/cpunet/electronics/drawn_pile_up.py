@@ -88,9 +88,8 @@ class TailsLaw:
 
     def draw(self, n: int, rng: np.random.Generator) -> Values:
         """Draw the tail in keV, summed over all earlier pulses, for `n` traces."""
-        row, kev, before_us = earlier_pulses(
-            n, self.rate_khz, LIFETIMES * self.decay_us, self.energies_kev, rng
-        )
+        energies, longest_us = self.energies_kev, LIFETIMES * self.decay_us
+        row, kev, before_us = earlier_pulses(n, self.rate_khz, longest_us, energies, rng)
         left = kev * np.exp(-before_us / self.decay_us)
         return np.asarray(np.bincount(row, left, minlength=n), float)
 
@@ -293,11 +292,8 @@ class InTracePileUp:
         order = np.argsort(self.kev, kind="stable")  # the largest is written last
         kev[self.row[order]] = self.kev[order]
         after_ns[self.row[order]] = self.after_ns[order]
-        return {
-            "n_piled": (np.bincount(self.row, minlength=self.n), ""),
-            "piled_kev": (kev, "keV"),
-            "piled_ns": (after_ns, "ns"),
-        }
+        n = np.bincount(self.row, minlength=self.n)
+        return {"n_piled": (n, ""), "piled_kev": (kev, "keV"), "piled_ns": (after_ns, "ns")}
 
     def reach(self, dt_ns: float) -> int:
         """Number of samples beyond a record that `added` needs for the earliest pulse."""
@@ -336,9 +332,8 @@ class InTracePileUp:
         [[0.0, 0.0, 0.25, 0.5, 0.5]]
         """
         total, time, own = np.zeros((self.n, length)), np.arange(length), len(shapes.T)
-        for row, kev, late, shape in zip(
-            self.row, self.kev, self.after_ns / dt_ns, shapes, strict=True
-        ):
+        each = zip(self.row, self.kev, self.after_ns / dt_ns, shapes, strict=True)
+        for row, kev, late, shape in each:
             moved = np.interp(time - late, np.arange(own), shape, left=0.0)
             total[row] += kev / energy_kev[row] * moved
         return total

@@ -42,7 +42,7 @@ from cpunet.electronics.chain import ComplexArray, FloatArray
 from cpunet.electronics.drawn_pile_up import TailsLaw, tail_shape
 from cpunet.errors import CpunetError
 from cpunet.pulses.baselines import Baselines
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import Pulses, shortest
 from cpunet.pulses.loading import InfoPart
 from cpunet.tables import with_std
 
@@ -149,9 +149,7 @@ def mode(values: FloatArray) -> float:
     """Mode of a one-sided distribution, by repeatedly halving the shortest half."""
     ordered = np.sort(values)
     while len(ordered) > 8:
-        half = len(ordered) // 2
-        first = int(np.argmin(ordered[half:] - ordered[:-half]))
-        ordered = ordered[first : first + half + 1]
+        ordered = shortest(ordered, len(ordered) // 2 + 1)
     return float(ordered.mean())
 
 
@@ -202,16 +200,12 @@ class TailsInfo(InfoPart):
         """Names and texts."""
         if not self.rate_khz:
             return [("pile-up tails", "none significant")]
-        shares = ", ".join(
-            f"{share['law']:.2g} % above {size.partition('_')[0]} keV"
-            for size, share in self.percent_above.items()
-        )
+        above = {size.partition("_")[0]: of["law"] for size, of in self.percent_above.items()}
+        shares = ", ".join(f"{share:.2g} % above {kev} keV" for kev, share in above.items())
         rate = f"{with_std(self.rate_khz, self.rate_error_khz)} kHz"
         by = f"estimated from {self.told_by}, error {self.error_kev:.2g} keV"
-        return [
-            ("pile-up tails", f"{rate}, decaying with {self.decay_us:.3g} µs"),
-            ("", f"{shares} ({by})"),
-        ]
+        rate += f", decaying with {self.decay_us:.3g} µs"
+        return [("pile-up tails", rate), ("", f"{shares} ({by})")]
 
 
 @dataclass(frozen=True, eq=False)
@@ -374,13 +368,11 @@ class PileUpTails:
         """Summary: the rate, its error, and fractions of traces above several thresholds."""
         law, surely = self.fit.law, self.law is not None
         measured = self.kev[np.isfinite(self.kev)]
-        percent = {
-            f"{kev:g}_kev": {
-                "measured": round(100 * float((measured > kev).mean()), 2),
-                "law": round(100 * float(law.share_above(kev)), 2) if surely else 0.0,
-            }
-            for kev in SHARES_KEV
-        }
+        percent = {}
+        for kev in SHARES_KEV:
+            shares = (measured > kev).mean(), law.share_above(kev) if surely else 0.0
+            seen, by_law = (round(100 * float(share), 2) for share in shares)
+            percent[f"{kev:g}_kev"] = {"measured": seen, "law": by_law}
         return TailsInfo(
             rate_khz=law.rate_khz if surely else 0.0,
             rate_error_khz=self.fit.rate_error_khz,

@@ -102,17 +102,11 @@ def linear_response(
 
 @kernel(parallel=True)
 def _follow(
-    pulses: Any,
-    factors: Any,
-    weights: Any,
-    first: Any,
-    ticks: Any,
-    per_sample: int,
-    traces: Any,
+    pulses: Any, factors: Any, weights: Any, first: Any, tick: Any, per_sample: int, traces: Any
 ) -> None:  # pragma: no cover - compiled
     """Fill each trace: fine steps while charge moves, each in two parts, then whole samples.
 
-    `ticks` are the fine samples with the first tick of the digitiser's clock.
+    `tick` is the fine sample with the first tick of the digitiser's clock.
     """
     n_fine, length = pulses.shape[1], traces.shape[1]
     for i in prange(len(pulses)):
@@ -125,7 +119,7 @@ def _follow(
             for k in range(len(state)):
                 total[k] += step[k, 1] * state[k] + step[k, 2] * x
                 state[k] = step[k, 0] * state[k] + step[k, 1] * x
-            since = j - ticks[i]
+            since = j - tick[i]
             if part == 2 or (part == 0 and since >= 0 and since % per_sample == 0):
                 value = 0.0
                 for k in range(len(state)):

@@ -302,10 +302,8 @@ def _write_data(
     whole: dict[str, Any] = {n: np.concatenate([part[n] for part in parts]) for n in parts[0]}
     saturated = whole["flag"] & FLAGS["saturated"] > 0
     if 2 * saturated.sum() > len(saturated):
-        raise CpunetError(
-            f"electronics {electronics.name}: {saturated.sum()} of {len(saturated)} traces "
-            "leave the ADC's range; lower gain_adc_per_kev or correct baseline_mean_adc and "
-            "adc_bits"
-        )
+        text = f"{saturated.sum()} of {len(saturated)} traces leave the ADC's range"
+        remedy = "lower gain_adc_per_kev or correct baseline_mean_adc and adc_bits"
+        raise CpunetError(f"electronics {electronics.name}: {text}", remedy)
     np.savez(folder / "data_labels.npz", **whole)
     return whole

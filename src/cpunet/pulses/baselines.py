@@ -7,9 +7,8 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import Pulses, Rows
 from cpunet.pulses.preparation import FloatColumn, Prepared, prepare
 from cpunet.recipes.schema import PreparationConfig
 
@@ -19,8 +18,6 @@ SHORTEST_SHARE = 0.1  # fraction of the baselines that may be shorter than those
 STORED_SHARE = 0.5  # the same for those stored, since those of some traces may be longer
 # Threshold of the start of a pulse, and time before it in which the pulse may already rise.
 START_FRACTION, START_SIGMAS, MARGIN_NS = 0.01, 8.0, 960.0
-
-Rows = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,30 +71,24 @@ class Baselines:
 
     @classmethod
     def of_block(
-        cls,
-        raw: Pulses,
-        prepared: Prepared,
-        config: PreparationConfig,
-        like: Baselines | None = None,
+        cls, raw: Pulses, ready: Prepared, config: PreparationConfig, like: Self | None = None
     ) -> Self:
         """Baselines of some traces, raw and prepared, as long as those of the first ones."""
-        config, windows = config.at(prepared.pulses.dt_ns), prepared.pulses.waveforms
+        config, windows = config.at(ready.pulses.dt_ns), ready.pulses.waveforms
         # start of the pulse proper: all samples from there to the alignment are above threshold
-        level = np.maximum(START_FRACTION, START_SIGMAS * prepared.baseline_rms)
+        level = np.maximum(START_FRACTION, START_SIGMAS * ready.baseline_rms)
         above = windows[:, : config.samples_before] >= level[:, np.newaxis]
-        start = config.samples_before - (~above[:, ::-1]).argmax(axis=1)
-        before = np.asarray(
-            prepared.align_sample - config.samples_before + start - config.samples(MARGIN_NS)
-        )
+        rise = (~above[:, ::-1]).argmax(axis=1)
+        before = np.asarray(ready.align_sample - rise - config.samples(MARGIN_NS))
         if like is not None:
             length, stored = like.length, like.first.length
         else:
             shares = np.quantile(before if len(before) else [0], (SHORTEST_SHARE, STORED_SHARE))
             length, stored = (max(int(samples), 0) for samples in shares)
         first = raw.with_waveforms(raw.waveforms[:, :stored].copy())
-        no_windows = prepared.pulses.with_waveforms(windows[:, :0].copy())
-        height = windows.max(axis=1) * prepared.scale
-        return cls(first, replace(prepared, pulses=no_windows), before, height, length)
+        no_windows = ready.pulses.with_waveforms(windows[:, :0].copy())
+        height = windows.max(axis=1) * ready.scale
+        return cls(first, replace(ready, pulses=no_windows), before, height, length)
 
     @classmethod
     def concatenate(cls, parts: Sequence[Baselines]) -> Self:

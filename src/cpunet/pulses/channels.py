@@ -65,17 +65,13 @@ def channels_of(file: PulseFile) -> dict[str, PulseFile]:
     """
     tables = [*table_sizes(file.path)]
     if not tables:
-        raise CpunetError(
-            f"{file.path}: holds no tables of waveforms of which to take all; leave out "
-            f"`data_table` {ALL} or `table` {ALL}"
-        )
+        text = f"{file.path}: holds no tables of waveforms of which to take all"
+        raise CpunetError(text, f"leave out `data_table` {ALL} or `table` {ALL}")
     energy = file.energy or ""
     places = {replace(file, table=table).place for table in tables}  # rows of one share it
     if ":" in energy and CHANNEL not in energy and len(places) > 1:
-        raise CpunetError(
-            f"{energy}: one column for {len(places)} channels; put {CHANNEL} into its path, as "
-            f"in hit.lh5:{CHANNEL}/hit/energy"
-        )
+        remedy = f"put {CHANNEL} into its path, as in hit.lh5:{CHANNEL}/hit/energy"
+        raise CpunetError(f"{energy}: one column for {len(places)} channels", remedy)
     return {
         name: replace(file, table=table, energy=energy.replace(CHANNEL, name) or None)
         for name, table in channel_names(tables).items()
@@ -112,9 +108,8 @@ class Outcome(Generic[R]):
     @property
     def ok(self) -> bool:
         """Whether no channel failed, and no result is bad."""
-        return not self.failed and all(
-            getattr(result, "ok", True) for result in self.done.values()
-        )
+        results = self.done.values()
+        return not self.failed and all(getattr(result, "ok", True) for result in results)
 
     def __str__(self) -> str:
         lines = {name: repr(result).strip("<>'") for name, result in self.done.items()}
@@ -141,16 +136,12 @@ def each_channel(channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R])
         If `out` is the output of one channel.
     """
     if out.is_file() or (out / MARKER).exists():
-        raise CpunetError(
-            f"{out}: is the output of one channel; choose another `out` for the folders of "
-            f"{len(channels)}"
-        )
+        remedy = f"choose another `out` for the folders of {len(channels)}"
+        raise CpunetError(f"{out}: is the output of one channel", remedy)
     done, failed = dict[str, R](), dict[str, str]()
     make = partial(partial, _one_channel, dict(channels), out, do)  # called in each process
-    with (
-        stage("Channels", len(channels)) as bar,
-        closing(outcomes(make, list(channels), usable_cores())) as results,
-    ):
+    made = outcomes(make, list(channels), usable_cores())
+    with stage("Channels", len(channels)) as bar, closing(made) as results:
         for name, outcome in results:
             bar.update()
             if isinstance(outcome, CpunetError):
@@ -164,10 +155,8 @@ def each_channel(channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R])
     )
 
 
-def _one_channel(
-    channels: Pairs, out: Path, do: Callable[[str, Pair, Path], R], name: str
-) -> R:
-    pair = channels[name]
+def _one_channel(pairs: Pairs, out: Path, do: Callable[[str, Pair, Path], R], name: str) -> R:
+    pair = pairs[name]
     if isinstance(pair, CpunetError):
         raise pair
     log.info(f"{name}:")

@@ -16,7 +16,9 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 FloatArray = npt.NDArray[np.float32]
-Which = slice | npt.NDArray[np.bool_] | npt.NDArray[np.int64]  # of some pulses
+Rows = npt.NDArray[np.int64]
+Flags = npt.NDArray[np.bool_]
+Which = slice | Flags | Rows  # of some pulses
 
 BLOCK = 512  # pulses at a time, to bound memory
 
@@ -70,9 +72,8 @@ class Pulses:
 
     def __post_init__(self) -> None:
         if self.waveforms.ndim != 2:
-            raise CpunetError(
-                f"waveforms have shape {self.waveforms.shape}; expected (pulses, samples)"
-            )
+            shape = self.waveforms.shape
+            raise CpunetError(f"waveforms have shape {shape}; expected (pulses, samples)")
         n = len(self.waveforms)
         for name in _PER_PULSE[1:]:
             shape = getattr(self, name).shape
@@ -150,10 +151,8 @@ class Pulses:
         first = sets[0]
         for other in sets[1:]:
             if (other.length, other.dt_ns) != (first.length, first.dt_ns):
-                raise CpunetError(
-                    f"cannot join {other.length} samples of {other.dt_ns} ns "
-                    f"to {first.length} samples of {first.dt_ns} ns"
-                )
+                both = [f"{of.length} samples of {of.dt_ns} ns" for of in (other, first)]
+                raise CpunetError(f"cannot join {both[0]} to {both[1]}")
         joined = {n: np.concatenate([getattr(s, n) for s in sets]) for n in _PER_PULSE}
         return Pulses(dt_ns=first.dt_ns, **joined)
 
@@ -165,10 +164,9 @@ def _numbers(values: npt.ArrayLike, kind: type[np.floating[Any]], name: str) -> 
             values = np.ma.filled(values.astype(kind), np.nan)
         return np.asarray(values, kind)
     except (ValueError, TypeError) as error:  # of awkward as of NumPy
-        raise CpunetError(
-            f"{name}: no plain numbers ({str(error).splitlines()[0][:100]})",
-            "give rows of equal length, and NaN for what is missing",
-        ) from error
+        remedy = "give rows of equal length, and NaN for what is missing"
+        why = str(error).splitlines()[0][:100]
+        raise CpunetError(f"{name}: no plain numbers ({why})", remedy) from error
 
 
 def blocks(n: int, size: int = BLOCK) -> Iterator[slice]:
@@ -186,3 +184,15 @@ def line_slope(n: int) -> npt.NDArray[np.float64]:
     """
     lever = np.arange(n) - (n - 1) / 2
     return np.asarray(lever / (lever @ lever))
+
+
+def shortest(ordered: npt.NDArray[np.float64], n: int) -> npt.NDArray[np.float64]:
+    """The `n` neighbours among sorted values that lie closest together.
+
+    Examples
+    --------
+    >>> shortest(np.array([0.0, 1.0, 5.0, 5.1, 5.2, 9.0]), 3)
+    array([5. , 5.1, 5.2])
+    """
+    first = int((ordered[n - 1 :] - ordered[: len(ordered) - n + 1]).argmin())
+    return ordered[first : first + n]

@@ -20,8 +20,8 @@ from pydantic import BaseModel, ConfigDict, Field
 from cpunet.errors import CpunetError
 from cpunet.progress import stage
 from cpunet.pulses import provenance
-from cpunet.pulses.baselines import TRACES, WHOLE, Baselines, Rows
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.baselines import TRACES, WHOLE, Baselines
+from cpunet.pulses.container import FloatArray, Pulses, Rows
 from cpunet.pulses.peaks import EnergySelection, label_peaks, suggested_calibration
 from cpunet.pulses.preparation import (
     Codes,
@@ -214,16 +214,13 @@ def load_pulses(
     elif tell:
         ends = prepared.pulses.waveforms[:, -recipe.preparation.tail_samples :].mean(axis=1)
         if np.median(ends) < MIN_SIMULATED_END:
-            log.warning(
-                f"{file.path.name}: these pulses decay; "
-                "are they simulated ones, without electronics?"
-            )
+            question = "are they simulated ones, without electronics?"
+            log.warning(f"{file.path.name}: these pulses decay; {question}")
     if tell:
         rejected = ", ".join(f"{n} {reason}" for reason, n in prepared.rejections.items())
-        log.info(
-            f"{file.path.name}: {len(prepared)} of {prepared.n_read} pulses used"
-            + (f" (left out: {rejected})" if rejected else "")
-        )
+        others = f" (left out: {rejected})" if rejected else ""
+        used = f"{len(prepared)} of {prepared.n_read} pulses used"
+        log.info(f"{file.path.name}: {used}{others}")
     return inputs
 
 
@@ -321,17 +318,11 @@ def _read(
     detector: str | None = None
     with suppress(ValueError, LookupError, TypeError):  # other programs may have such a name
         detector = str(json.loads(source.attrs[provenance.SIMULATION])["detector"]["name"])
-    inputs = InputSet(
-        _joined(sets),
-        source.dt_ns,
-        source.path,
-        energies_kev=energies[np.isfinite(energies)],
-        recipe=recipe,
-        cuts=None,
-        read_as=file.options,
-        detector=detector,
-        baselines=Baselines.concatenate(baselines) if measured else None,
-        counts=counts,
+    joined, finite = _joined(sets), energies[np.isfinite(energies)]
+    inputs = InputSet(joined, source.dt_ns, source.path, energies_kev=finite, recipe=recipe)
+    stored = Baselines.concatenate(baselines) if measured else None
+    inputs = replace(
+        inputs, read_as=file.options, detector=detector, baselines=stored, counts=counts
     )
     if not n:
         raise _nothing_left(inputs, selection, first, heights)
@@ -449,23 +440,17 @@ def require_both_sides(sim: InputSet, data: InputSet, selection: EnergySelection
     CpunetError
         If a selected line or range has pulses on one side only.
     """
+    energies = {side: side.prepared.pulses.energy_kev for side in (sim, data)}
     for part in selection.parts:
-        counts = {
-            side: int(part.select(side.prepared.pulses.energy_kev).sum())
-            for side in (sim, data)
-        }
+        counts = {side: int(part.select(kev).sum()) for side, kev in energies.items()}
         missing, other = sorted(counts, key=lambda side: counts[side])
         if not counts[other]:
-            raise CpunetError(
-                f"{sim.path}, {data.path}: neither has a pulse of {part.name} that can be used",
-                "leave it out of `peak`",
-            )
+            neither = f"neither has a pulse of {part.name} that can be used"
+            raise CpunetError(f"{sim.path}, {data.path}: {neither}", "leave it out of `peak`")
         if not counts[missing]:
-            raise CpunetError(
-                f"{missing.path}: no pulse of {part.name} can be used, {other.path.name} has "
-                f"{counts[other]}",
-                "leave it out of `peak`, or give a file that has them",
-            )
+            others = f"{other.path.name} has {counts[other]}"
+            text = f"{missing.path}: no pulse of {part.name} can be used, {others}"
+            raise CpunetError(text, "leave it out of `peak`, or give a file that has them")
     lines = selection.lines_in_ranges
     if not lines:
         return []

@@ -21,7 +21,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, Pulses, blocks, line_slope
+from cpunet.pulses.container import FloatArray, Pulses, blocks, line_slope, shortest
 from cpunet.recipes.schema import PreparationConfig, ScoreConfig
 
 Values = npt.NDArray[np.float64]
@@ -130,6 +130,20 @@ def current_amplitude(waveforms: FloatArray, dt_ns: float) -> Values:
             values[unsure] = highest(current[unsure])
         amplitudes[rows] = values
     return amplitudes
+
+
+def shorth(values: Values) -> float:
+    """Median of the shortest half of the values.
+
+    For current amplitudes this is the single-site peak, which is the narrowest.
+
+    Examples
+    --------
+    >>> shorth(np.array([0.0, 1.0, 5.0, 5.1, 5.2, 9.0]))
+    5.1
+    """
+    ordered = np.sort(values[np.isfinite(values)])
+    return float(np.median(shortest(ordered, len(ordered) // 2 + 1)[:-1]))
 
 
 def current_amplitude_kernel(dt_ns: float) -> npt.NDArray[np.float32]:
@@ -349,10 +363,8 @@ def align_half_maximum(waveforms: FloatArray, n_before: int, n_after: int) -> Fl
 def require_pulses(waveforms: FloatArray, shortest: int) -> None:
     """Raise a `CpunetError` unless an array has the shape (pulses, samples)."""
     if waveforms.ndim != 2 or waveforms.shape[1] < shortest:
-        raise CpunetError(
-            f"waveforms have shape {waveforms.shape}; "
-            f"expected (pulses, samples) with {shortest} samples or more"
-        )
+        expected = f"expected (pulses, samples) with {shortest} samples or more"
+        raise CpunetError(f"waveforms have shape {waveforms.shape}; {expected}")
 
 
 def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
@@ -363,14 +375,13 @@ def aligned_block(waveforms: FloatArray, n_before: int, n_after: int) -> Values:
     finite = np.isfinite(waveforms).all(axis=1)
     top = np.where(finite, waveforms.argmax(axis=1), 0)
     height = waveforms[np.arange(len(waveforms)), top]
-    # the last sample before the maximum that is below its half, -1 without any
+    # the last sample before the maximum that is below its half
     below = waveforms < 0.5 * height[:, np.newaxis]
     below &= np.arange(waveforms.shape[1]) < top[:, np.newaxis]
     last = waveforms.shape[1] - 1 - below[:, ::-1].argmax(axis=1)
-    before = np.where(below.any(axis=1), last, -1)
-    if not (usable := finite & (height > 0) & (before >= 0)).any():
+    if not (usable := finite & (height > 0) & below.any(axis=1)).any():
         return moved
-    pulses, before = waveforms[usable], before[usable]
+    pulses, before = waveforms[usable], last[usable]
     padded = np.pad(pulses.astype(float), ((0, 0), (PAD, PAD)), mode="edge")
     coefficients = spline_filter1d(padded, order=3, axis=1)
     level = 0.5 * pulses.max(axis=1).astype(float)

@@ -13,6 +13,8 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.recipes.schema import PeakConfig
 
+Peaks = Mapping[str, PeakConfig]  # by name
+
 _NUMBER = r"(\d+(?:\.\d*)?(?:[eE]\+?\d+)?)"
 _RANGE = re.compile(rf"{_NUMBER}\s*-\s*{_NUMBER}?")
 
@@ -36,9 +38,7 @@ HIGHEST = 12.0  # maximum contribution of one line, in standard deviations
 CLEAR, MIN_LINES = 4.0, 3  # significance of a clear line; clear lines required
 
 
-def label_peaks(
-    energy_kev: npt.ArrayLike, peaks: Mapping[str, PeakConfig]
-) -> npt.NDArray[np.str_]:
+def label_peaks(energy_kev: npt.ArrayLike, peaks: Peaks) -> npt.NDArray[np.str_]:
     """Name the gamma line whose window contains each energy.
 
     Parameters
@@ -65,9 +65,8 @@ def label_peaks(
     centres, widths = np.transpose(lines)
     # NaN is in no window, since every comparison with it is false.
     distance = np.abs(energies[:, np.newaxis] - centres)
-    nearest: npt.NDArray[np.intp] = np.where(distance <= widths, distance, np.inf).argmin(
-        axis=1
-    )
+    inside = np.where(distance <= widths, distance, np.inf)
+    nearest: npt.NDArray[np.intp] = inside.argmin(axis=1)
     return names[nearest]
 
 
@@ -88,7 +87,7 @@ class EnergySelection:
     """
 
     name: str
-    peaks: Mapping[str, PeakConfig]
+    peaks: Peaks
     chosen: tuple[str, ...] = ()
     ranges_kev: tuple[tuple[float, float], ...] = ()
 
@@ -117,7 +116,7 @@ class EnergySelection:
         return mask
 
 
-def parse_selection(text: str, peaks: Mapping[str, PeakConfig]) -> EnergySelection:
+def parse_selection(text: str, peaks: Peaks) -> EnergySelection:
     """Parse a selection: lines and ranges in keV, separated by commas.
 
     Parameters

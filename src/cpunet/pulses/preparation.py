@@ -35,7 +35,7 @@ import numpy.typing as npt
 from cpunet.errors import CpunetError
 from cpunet.pulses import _kernels
 from cpunet.pulses._kernels import Rejection as Rejection
-from cpunet.pulses.container import Pulses, Which
+from cpunet.pulses.container import Pulses, Rows, Which
 from cpunet.recipes.schema import CutConfig, PreparationConfig
 from cpunet.settings import Config
 
@@ -81,7 +81,7 @@ class Prepared:
     """
 
     pulses: Pulses
-    index: npt.NDArray[np.int64]
+    index: Rows
     baseline: FloatColumn
     scale: FloatColumn
     align_sample: npt.NDArray[np.int64]

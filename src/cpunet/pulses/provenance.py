@@ -11,7 +11,7 @@ from __future__ import annotations
 import json
 import logging
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
@@ -21,10 +21,10 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, line_slope
-from cpunet.pulses.parameters import tail_slope
-from cpunet.pulses.peaks import label_peaks, suggested_calibration
+from cpunet.pulses.parameters import Values, tail_slope
+from cpunet.pulses.peaks import Peaks, label_peaks, suggested_calibration
 from cpunet.pulses.reading.source import PulseSource, amplitude
-from cpunet.recipes.schema import PeakConfig, PreparationConfig, Recipe
+from cpunet.recipes.schema import PreparationConfig, Recipe
 from cpunet.settings import flat
 from cpunet.tables import counted, span
 
@@ -34,13 +34,10 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 Words = list[tuple[str, str]]
-Values = npt.NDArray[np.float64]
 
 # attributes of a table, and of a file
-SIDE, MADE_BY, TRANSLATED_BY, RUN, SIMULATION = (
-    "side", "made_by", "translated_by", "run", "simulation",
-)  # fmt: skip
-TRANSLATION = "cpunet_translation"
+SIDE, MADE_BY, TRANSLATED_BY = "side", "made_by", "translated_by"
+RUN, SIMULATION, TRANSLATION = "run", "simulation", "cpunet_translation"
 REN, IREN, SIMULATE = "cpunet ren", "cpunet iren", "cpunet simulate"
 _NETWORKS = {REN: "REN", IREN: "IREN"}
 
@@ -235,10 +232,8 @@ def trace_properties(whole: Pulses, config: PreparationConfig) -> Words:
     slopes = tail_slope(windows - baselines, whole.dt_ns, config.decay_fit_samples)
     slopes = slopes[np.isfinite(slopes)]
     slope = float(np.median(slopes)) / 1e3 if len(slopes) >= MIN_NUMBER else 0.0  # in 1/µs
-    return [
-        ("decay", f"{-1 / slope:.3g} µs" if slope < 0 else "the tails do not decay"),
-        ("noise", f"{noise} (RMS of a baseline, median)"),
-    ]
+    decay = f"{-1 / slope:.3g} µs" if slope < 0 else "the tails do not decay"
+    return [("decay", decay), ("noise", f"{noise} (RMS of a baseline, median)")]
 
 
 def left_out(whole: Pulses, recipe: Recipe) -> str:
@@ -252,9 +247,7 @@ def left_out(whole: Pulses, recipe: Recipe) -> str:
     return f"{counted(prepared.rejections) or 'none'} of {len(whole)} traces"
 
 
-def describe_pulses(
-    source: PulseSource, blocks: Iterable[Pulses], peaks: Mapping[str, PeakConfig]
-) -> Words:
+def describe_pulses(source: PulseSource, blocks: Iterable[Pulses], peaks: Peaks) -> Words:
     """Describe the pulses of one table, by names and texts.
 
     The file is read in blocks; only energies or amplitudes of all pulses are held in memory.

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import hist
 import numpy as np
+from hist.axis import Regular
 
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import FloatArray, Pulses, blocks
@@ -113,10 +114,8 @@ SHAPE_PARAMETERS: dict[str, Parameter] = {
     "drift_time": PARAMETERS["drift_time"],
     **{name: Parameter(f"t({100 * f:g} %)", "ns") for name, f in TIME_POINTS.items()},
     **{
-        name: Parameter(
-            f"Rise time {'–'.join(f'{100 * TIME_POINTS[t]:g}' for t in ends)} %", "ns"
-        )
-        for name, ends in RISE_TIMES.items()
+        f"rise_{ends}": Parameter(f"Rise time {ends.lstrip('0').replace('_', '–')} %", "ns")
+        for ends in _RISES
     },
     **{name: Parameter(name, "ns") for name in ("tp_0_est", "tp_50", "tp_90", "tp_99")},
     "rise_time": Parameter("T(10–90 %)", "ns"),
@@ -179,16 +178,13 @@ def all_parameters(
     """
     dt_ns, preparation = pulses.dt_ns, preparation.at(pulses.dt_ns)
     if pulses.length != preparation.length:
-        raise CpunetError(
-            f"the pulses have {pulses.length} samples and prepared ones "
-            f"{preparation.length}; prepare them first"
-        )
+        text = f"the pulses have {pulses.length} samples and prepared ones {preparation.length}"
+        raise CpunetError(text, "prepare them first")
     values = {name: np.full(len(pulses), np.nan) for name in SHAPE_PARAMETERS}
     if decay_ns is None:
         finite = np.isfinite(pulses.waveforms).all(axis=1)
-        decay_ns = median_decay_ns(
-            tail_slope(pulses.waveforms[finite], dt_ns, preparation.decay_fit_samples)
-        )
+        slopes = tail_slope(pulses.waveforms[finite], dt_ns, preparation.decay_fit_samples)
+        decay_ns = median_decay_ns(slopes)
     n, aligned = preparation.baseline_samples, preparation.samples_before
     lever = np.arange(n) - (n - 1) / 2
     for rows in blocks(len(pulses), BLOCK):
@@ -233,7 +229,7 @@ MAX_BINS = 49
 FENCE = 3.0
 
 
-def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
+def data_axis(data: Values, max_bins: int) -> Regular:
     r"""Binning of a parameter from its measured values alone.
 
     The axis spans the data within three interquartile ranges (IQR) of the quartiles, with
@@ -278,12 +274,10 @@ def data_axis(data: Values, max_bins: int) -> hist.axis.Regular:
     # The last edge is exclusive, but a maximum inside the fence is not an overflow: after
     # rounding, (maximum - low) / (last edge - low) must be less than 1.
     margin = 4 * np.spacing(max(abs(low), abs(high)))
-    return hist.axis.Regular(bins, low, high + margin)
+    return Regular(bins, low, high + margin)
 
 
-def labelled(
-    axis: hist.axis.Regular, parameter: str, bins: int | None = None
-) -> hist.axis.Regular:
+def labelled(axis: Regular, parameter: str, bins: int | None = None) -> Regular:
     """The same range, in so many bins if given, with the parameter's name and label.
 
     Raises
@@ -295,7 +289,7 @@ def labelled(
         raise CpunetError(f"`bins` is {bins}", "give 1 or more")
     low, *_, high = axis.edges
     label = LABELLED[parameter].axis_label
-    return hist.axis.Regular(bins or axis.size, low, high, name=parameter, label=label)
+    return Regular(bins or axis.size, low, high, name=parameter, label=label)
 
 
 class Histogram(hist.Hist[Any], family=hist):

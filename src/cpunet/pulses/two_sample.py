@@ -19,12 +19,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import FloatArray, blocks
+from cpunet.pulses.container import FloatArray, Rows, blocks
+from cpunet.pulses.parameters import Values
 
-Values = npt.NDArray[np.float64]
 Parameters = Mapping[str, Values]
 
 MIN_PULSES = 40  # pulses per side: 8 in each test fold
@@ -112,32 +111,44 @@ def classifier_auc(
     CpunetError
         If a side has fewer than 40 pulses with only finite values.
     """
-    sides = (data, others)
-    extras = [
-        np.column_stack([np.empty((len(windows), 0)), *values.values()])
-        for windows, values in zip(sides, features or ({}, {}), strict=True)
-    ]
-    rng = np.random.default_rng(seed)
-    usable = [
-        np.flatnonzero(np.isfinite(windows).all(axis=1) & np.isfinite(extra).all(axis=1))
-        for windows, extra in zip(sides, extras, strict=True)
-    ]
+    sides, rng = (data, others), np.random.default_rng(seed)
+    extras, usable = list[Values](), list[Rows]()
+    for side, values in zip(sides, features or ({}, {}), strict=True):
+        extras.append(np.column_stack([np.empty((len(side), 0)), *values.values()]))
+        finite = np.isfinite(side).all(axis=1) & np.isfinite(extras[-1]).all(axis=1)
+        usable.append(np.flatnonzero(finite))
     if same_events:
         usable = [np.intersect1d(usable[0], usable[1])] * 2
     size = min(LARGEST, *map(len, usable))
     if size < MIN_PULSES:
-        raise CpunetError(
-            f"{len(usable[0])} measured and {len(usable[1])} simulated pulses are usable, "
-            f"and {size} of each would be compared; a two-sample test needs {MIN_PULSES} "
-            "of each"
-        )
+        both = f"{len(usable[0])} measured and {len(usable[1])} simulated pulses are usable"
+        needed = f"a two-sample test needs {MIN_PULSES} of each"
+        raise CpunetError(f"{both}, and {size} of each would be compared; {needed}")
     rows = [np.sort(rng.choice(own, size, replace=False)) for own in usable]
     if same_events:
         rows[1] = rows[0]
     windows = np.concatenate([s[r] for s, r in zip(sides, rows, strict=True)]).astype(float)
     extra = np.concatenate([e[r] for e, r in zip(extras, rows, strict=True)])
 
-    aucs, stds = _cross_validated(_expanded(windows, extra), rng, same_events)
+    # Equal numbers of both sides in each fold, in which labels are shuffled: unequal ones would
+    # bias the AUC to below 0.5, since a side that is rare in the training is frequent in the
+    # test.
+    folds = [rng.permutation(np.arange(size) % FOLDS) for _ in range(2)]
+    fold = np.concatenate([folds[0], folds[0] if same_events else folds[1]])
+    labels = np.repeat(np.repeat([-1.0, 1.0], size)[:, np.newaxis], 1 + SHUFFLES, axis=1)
+    for k in range(FOLDS):
+        inside = np.flatnonzero(fold == k)
+        labels[inside, 1:] = rng.permuted(labels[inside, 1:], axis=0)
+
+    # AUC of the true labels and of each shuffle, and their errors for independent folds
+    expanded, by_fold = _expanded(windows, extra), np.empty((2, FOLDS, 1 + SHUFFLES))
+    for k in range(FOLDS):
+        test = fold == k
+        scores = expanded[test] @ _ridge(expanded[~test], labels[~test])
+        by_label = np.argsort(labels[test], axis=0, kind="stable")
+        halves = np.split(np.take_along_axis(scores, by_label, axis=0), 2)
+        by_fold[:, k] = auc_and_variance(*halves)
+    aucs, stds = by_fold[0].mean(axis=0), np.sqrt(by_fold[1].sum(axis=0)) / FOLDS
     null_std, delong = aucs[1:].std(ddof=1), np.sqrt((stds[1:] ** 2).mean())
     widened = max(1.0, null_std / delong) if delong > 0 else 1.0
     missing = (len(side) - len(rows) for side, rows in zip(sides, usable, strict=True))
@@ -216,11 +227,9 @@ def _expanded(windows: Values, extra: Values) -> Values:
     main = np.delete(plain, np.s_[LEADING : components.shape[1]], axis=1)
     i, j = np.triu_indices(main.shape[1])
     products = main[:, i] * main[:, j]
-    waves = np.column_stack(
-        [np.sin(WAVES[0] * main), *(np.cos(frequency * main) for frequency in WAVES)]
-    )
+    waves = [np.sin(WAVES[0] * main), *(np.cos(frequency * main) for frequency in WAVES)]
     parts = [plain]
-    for part in (products, waves):
+    for part in (products, np.column_stack(waves)):
         part = part - part.mean(axis=0)
         spread = part.std(axis=0)
         weight = np.sqrt(2 * main.shape[1] / part.shape[1])
@@ -235,33 +244,6 @@ def _standard(values: Values, smallest: float = 0.0) -> Values:
     # a column without spread becomes 0: rounding must not be amplified to a feature
     scale = np.where(spread > smallest, spread, np.inf)
     return np.asarray(np.clip((values - middle) / scale, -OUTLIER, OUTLIER))
-
-
-def _cross_validated(
-    features: Values, rng: np.random.Generator, same_events: bool
-) -> tuple[Values, Values]:
-    """AUC of the true labels and of each shuffle, and their errors for independent folds.
-
-    The first half of the rows is one side.  Each fold has equal numbers of both sides, and
-    labels are shuffled within it.  Unequal numbers would bias the AUC to below 0.5, since a
-    side that is rare in the training is frequent in the test.
-    """
-    size = len(features) // 2
-    folds = [rng.permutation(np.arange(size) % FOLDS) for _ in range(2)]
-    fold = np.concatenate([folds[0], folds[0] if same_events else folds[1]])
-    labels = np.repeat(np.repeat([-1.0, 1.0], size)[:, np.newaxis], 1 + SHUFFLES, axis=1)
-    for k in range(FOLDS):
-        rows = np.flatnonzero(fold == k)
-        labels[rows, 1:] = rng.permuted(labels[rows, 1:], axis=0)
-
-    aucs, variances = np.empty((2, FOLDS, 1 + SHUFFLES))
-    for k in range(FOLDS):
-        test = fold == k
-        scores = features[test] @ _ridge(features[~test], labels[~test])
-        by_label = np.argsort(labels[test], axis=0, kind="stable")
-        halves = np.split(np.take_along_axis(scores, by_label, axis=0), 2)
-        aucs[k], variances[k] = auc_and_variance(*halves)
-    return aucs.mean(axis=0), np.sqrt(variances.sum(axis=0)) / FOLDS
 
 
 def _ridge(features: Values, labels: Values) -> Values:

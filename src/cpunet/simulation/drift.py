@@ -16,13 +16,6 @@ from cpunet.simulation.drift_maps import HOLE, DriftMaps, carrier_velocity, in_d
 from cpunet.simulation.geometry import FloatArray
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
-# 2.355**2 times 0.12 V mm/cm, as rounded in siggen
-SIGGEN_DIFFUSION = 0.67
-BOLTZMANN_V_PER_K = 8.617333e-5
-# siggen's self-repulsion of a cloud of 1 keV: 0.003 keV per electron-hole pair, a relative
-# permittivity of 16, and its rounded FWHM per sigma
-REPULSION_PER_KEV = 1.0 / 0.003 / 6.241e18 * 0.67**3 * 9e13 / 16 * 2.355**3
-SMALLEST_FWHM_MM = 0.01  # initial FWHM of a cloud that grows, at least
 _MAX_REPULSION = 0.05
 _CUT_FWHM = 2.0
 
@@ -63,20 +56,14 @@ def cloud_after_step(
     r = min(repulsion * slope / (size * size), _MAX_REPULSION)
     growth = d / size + r
     if growth > 0.05 or growth * step_ns > 0.1:
-        return math.sqrt(
-            2.0 * d * step_ns + (size * size * (size + 3.0 * r * step_ns)) ** (2.0 / 3.0)
-        )
+        cube = size * size * (size + 3.0 * r * step_ns)
+        return math.sqrt(2.0 * d * step_ns + cube ** (2.0 / 3.0))
     return size + growth * step_ns
 
 
 @kernel(fastmath=True)
 def smear_and_sample(
-    signal: FloatArray,
-    per_sample: int,
-    sigma: float,
-    last: int,
-    weight: float,
-    out: FloatArray,
+    signal: FloatArray, per_sample: int, sigma: float, last: int, weight: float, out: FloatArray
 ) -> None:
     r"""Convolve a signal with a Gaussian, average it over blocks and add it to `out`.
 
@@ -123,6 +110,8 @@ def smear_and_sample(
         out[j] += weight * total
 
 
+Place = tuple[float, float, float]  # x, y, z in mm
+
 # A carrier is collected once its signal can change by less than this fraction of full scale.
 _COLLECTED = 5e-5
 # Holes that move slowly along the edge of the contact also count as collected.
@@ -133,7 +122,7 @@ _AT_CONTACT, _CREEPING = 0.999, 2e-4
 def drift(
     maps: DriftMaps,
     carrier: int,
-    start: tuple[float, float, float],
+    start: Place,
     step_ns: float,
     stride: int,
     cloud: tuple[float, float, float],
@@ -242,12 +231,7 @@ def _arrived(carrier: int, wp: float, rise: float, potential: float, bias_V: flo
 
 
 @kernel(inline="always")
-def _moved(
-    maps: DriftMaps,
-    carrier: int,
-    here: tuple[float, float, float],
-    step: tuple[float, float, float],
-) -> tuple[float, float, float]:
+def _moved(maps: DriftMaps, carrier: int, here: Place, step: Place) -> Place:
     """Place after a step. Charges slide along the passivated face, holes along the ditch."""
     x, y, z = here[0] + step[0], here[1] + step[1], max(here[2] + step[2], 0.0)
     p = math.sqrt(x * x + y * y) * maps.per_mm

@@ -17,7 +17,7 @@ field strength,
 from __future__ import annotations
 
 import math
-from importlib.resources import files
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -94,9 +94,8 @@ def velocity_table(
     0.081
     """
     # field in V/cm, then e100, e110, e111, h100, h110, h111 in mm/ns
-    source = files("cpunet.simulation").joinpath("drift_velocity.csv")
-    with source.open(encoding="utf-8") as lines:
-        measured = np.loadtxt(lines, delimiter=",", comments=("#", "field"))
+    file = Path(__file__).with_name("drift_velocity.csv")
+    measured = np.loadtxt(file, delimiter=",", comments=("#", "field"), encoding="utf-8")
     field = measured[:, 0]
     step = float(np.gcd.reduce(np.round(field).astype(np.int64)))
     grid = np.arange(round(field[-1] / step) + 1) * step
@@ -196,9 +195,7 @@ class DriftMaps(NamedTuple):
     trapping_per_ns: FloatArray
 
 
-def drift_maps(
-    fields: FieldMaps, temperature_K: float, settings: SimulationSettings
-) -> DriftMaps:
+def drift_maps(fields: FieldMaps, kelvin: float, settings: SimulationSettings) -> DriftMaps:
     """Prepare field maps for the drift: extrapolated into contacts, refined if coarse.
 
     Of the `settings`, only the velocity factors and trapping rates are used.
@@ -231,7 +228,7 @@ def drift_maps(
         # nodes at the corners of the cells of the ditch
         ditch = ~_all_corners(~np.pad(np.kron(_all_corners(ditch), fine), 1))
         usable = np.kron(usable, fine)
-    coefficients, per_field = velocity_table(temperature_K, settings)
+    coefficients, per_field = velocity_table(kelvin, settings)
     per_us = settings.electron_trapping_per_us, settings.hole_trapping_per_us
     return DriftMaps(
         values=np.ascontiguousarray(values),

@@ -140,8 +140,8 @@ def compute_fields(detector: Detector) -> FieldMaps:
     """
     parts, bias = solve(detector), detector.bias_V
     impurity = detector.impurity_scale, detector.impurity_tilt_1e10_per_cm4
-    potential = parts.total_V(bias, *impurity)
-    if has_pocket(potential, parts.region):
+    volts = parts.total_V(bias, *impurity)
+    if has_pocket(volts, parts.region):
         if (needed := parts.depletion(*impurity)) == math.inf:
             raise CpunetError(
                 f"detector {detector.name}: no bias up to {HIGHEST_BIAS_V:.0f} V depletes it; "
@@ -153,13 +153,9 @@ def compute_fields(detector: Detector) -> FieldMaps:
         )
     # without a charge or a plane below it, the field has no component normal to the face z = 0
     mirror = not (detector.vacuum_gap or detector.surface_charge_1e10_per_cm2)
-    e_r, e_z = electric_field(potential, parts, mirror=mirror)
+    e_r, e_z = electric_field(volts, parts, mirror=mirror)
     return FieldMaps(
-        **vars(parts),
-        potential_V=potential,
-        e_r_V_per_cm=e_r,
-        e_z_V_per_cm=e_z,
-        impurity=impurity,
+        **vars(parts), potential_V=volts, e_r_V_per_cm=e_r, e_z_V_per_cm=e_z, impurity=impurity
     )
 
 
@@ -192,10 +188,8 @@ def scaled_to_depletion(detector: Detector) -> Detector:
             f"times its impurities none depletes at {measured:g} V; correct "
             "measured_depletion_V, impurity_z0_1e10_per_cm3 or surface_charge_1e10_per_cm2"
         )
-    log.info(
-        f"{detector.name}: impurities times {low:.4g}, so that it depletes at the measured "
-        f"{measured:g} V"
-    )
+    voltage = f"the measured {measured:g} V"
+    log.info(f"{detector.name}: impurities times {low:.4g}, so that it depletes at {voltage}")
     return detector.model_copy(update={"impurity_scale": low})
 
 
@@ -232,18 +226,16 @@ def electric_field(
     (True, [-1000.0, -1000.0, -1000.0, -1000.0])
     """
     components = []
-    for volts, steps, region in (
-        (potential, grid.r_steps, grid.region),
-        (potential.T, grid.z_steps.T, grid.region.T),
-    ):
+    along_r = potential, grid.r_steps, grid.region
+    along_z = potential.T, grid.z_steps.T, grid.region.T
+    for volts, steps, region in (along_r, along_z):
         # the parabola through a node and its neighbours; across a wall of the ditch the slope
         # jumps: only the germanium side counts
         ditch = region == DITCH
         rise = np.diff(volts, axis=0) / (steps * grid.grid_mm)
         weight = np.where(ditch[:-1] & ditch[1:], 1e-9, 1.0) / (steps * grid.grid_mm)
-        slope = on_nodes(weight * rise, weight * rise, axis=0) / on_nodes(
-            weight, weight, axis=0
-        )
+        slope = on_nodes(weight * rise, weight * rise, axis=0)
+        slope /= on_nodes(weight, weight, axis=0)
         components.append(-_V_PER_CM * slope)
     e_r, e_z = components[0], components[1].T
     e_r[0] = 0
@@ -270,10 +262,9 @@ def fields_in_words(detector: Detector, fields: FieldMaps) -> list[tuple[str, st
         ("impurity_scale", f"{scale:.6g}" if scale != 1 else ""),
         ("bias", f"{detector.bias_V:g} V"),
     ]
-    for name, node in (
-        ("lowest field", np.where(bulk, strength, np.inf).argmin()),
-        ("highest field", np.where(bulk, strength, -np.inf).argmax()),
-    ):
+    lowest = np.where(bulk, strength, np.inf).argmin()
+    highest = np.where(bulk, strength, -np.inf).argmax()
+    for name, node in (("lowest field", lowest), ("highest field", highest)):
         i, j = np.unravel_index(node, strength.shape)
         place = f"r {fields.r_mm[i]:.1f}, z {fields.z_mm[j]:.1f} mm"
         lines.append((name, f"{strength[i, j]:.0f} V/cm at {place}"))

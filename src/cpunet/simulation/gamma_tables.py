@@ -11,7 +11,7 @@ Radiation (1954), § 27. Energies are in MeV.
 from __future__ import annotations
 
 import functools
-from importlib import resources
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -70,9 +70,8 @@ class ElectronTable(NamedTuple):
 @functools.cache
 def photon_table() -> PhotonTable:
     """Photon cross sections of XCOM without coherent scattering, which deposits no energy."""
-    source = resources.files(__package__) / "gamma_cross_sections.csv"
-    with source.open() as lines:
-        data = np.loadtxt(lines, delimiter=",", comments=("#", "E_MeV"))
+    file = Path(__file__).with_name("gamma_cross_sections.csv")
+    data = np.loadtxt(file, delimiter=",", comments=("#", "E_MeV"))
     energy, incoherent, photoelectric = data[:, 0], data[:, 2], data[:, 3]
     pair = data[:, 4] + data[:, 5]
     log = np.linspace(np.log(energy[0]), np.log(energy[-1]), _PHOTON_NODES)

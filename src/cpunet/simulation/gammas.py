@@ -306,17 +306,15 @@ def follow_photons(medium: Medium, event: Event, rng: np.random.Generator) -> No
             break
 
 
+# energy (MeV), height above the crystal and radius (mm), and cosine of a cone's half angle
+Source = tuple[float, float, float, float]
+
+
 @kernel(error_model="numpy")
-def emit(
-    outline: Outline,
-    source: tuple[float, float, float, float],
-    event: Event,
-    rng: np.random.Generator,
-) -> None:
+def emit(outline: Outline, source: Source, event: Event, rng: np.random.Generator) -> None:
     """Place a photon where it meets the cylinder around the crystal; none if it misses.
 
-    The source is a disc above the crystal that emits into a cone about the axis: energy (MeV),
-    height above the crystal and radius (mm), and cosine of the cone's half angle.
+    The source is a disc above the crystal that emits into a cone about the axis.
     """
     energy, height, disc, least_cosine = source
     radius, length = outline.crystal_radius, outline.crystal_length
@@ -346,7 +344,7 @@ def emit(
 @kernel(error_model="numpy")
 def simulate_events(
     medium: Medium,
-    source: tuple[float, float, float, float],
+    source: Source,
     n_primaries: int,
     windows: FloatArray,
     missing: IntArray,

@@ -224,12 +224,9 @@ class Detector(Config):
         True
         """
         r, z = np.asarray(r, float), np.asarray(z, float)
-        axial = (
-            self.impurity_z0_1e10_per_cm3
-            + self.impurity_gradient_1e10_per_cm4 * z / 10
-            + self.impurity_quadratic_1e10_per_cm3
-            * (1 - (2 * z / self.crystal_length - 1) ** 2)
-        )
+        axial = self.impurity_z0_1e10_per_cm3 + self.impurity_gradient_1e10_per_cm4 * z / 10
+        bent = 1 - (2 * z / self.crystal_length - 1) ** 2
+        axial = axial + self.impurity_quadratic_1e10_per_cm3 * bent
         if length_mm := self.impurity_exponential_length_mm:
             axial = axial + self.impurity_exponential_1e10_per_cm3 * np.exp(-z / length_mm)
         radial = (r / self.crystal_radius) ** self.impurity_radial_power

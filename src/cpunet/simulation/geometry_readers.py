@@ -103,9 +103,7 @@ def read_detector(path: str | Path | Detector, overrides: Set = ()) -> Detector:
     values |= given
     if by_depletion := values.get("impurity_scale") == "depletion":
         del values["impurity_scale"]
-    missing = {
-        key: f"missing ({why}); give `settings` {key}=VALUE" for key, why in hints.items()
-    }
+    missing = {k: f"missing ({why}); give `settings` {k}=VALUE" for k, why in hints.items()}
     detector = checked(Detector, values, name, missing)
     if not by_depletion:
         return detector
@@ -209,10 +207,8 @@ def _fit(values: dict[str, float], name: str) -> None:
             own_angle = math.degrees(math.atan(widths[side] / length))
             if not math.isclose(own_angle, angle or math.nan):
                 values[field] = own_angle
-    taper = values.get("bottom_taper_length", 0.0)
-    if around >= values.get("crystal_radius", math.inf) - taper and not values.get(
-        "ditch_depth"
-    ):
+    wall = values.get("crystal_radius", math.inf) - values.get("bottom_taper_length", 0.0)
+    if around >= wall and not values.get("ditch_depth"):
         values["wrap_around_radius"] = 0.0  # no wrap-around: lithium ends at the wall
 
 
@@ -233,10 +229,8 @@ def detector_values(
     """
     source, kind = f"detector {name}", diode.get("type")
     if kind is not None and kind not in _SIMULATED:  # semi-coaxial ones collect on their bore
-        raise CpunetError(
-            f"{source}: type {reprlib.repr(kind)} is not simulated; "
-            f"give one of type {', '.join(_SIMULATED)}"
-        )
+        remedy = f"give one of type {', '.join(_SIMULATED)}"
+        raise CpunetError(f"{source}: type {reprlib.repr(kind)} is not simulated", remedy)
     geometry = dict(flat(diode["geometry"]))
     cracked = any(key.startswith("extra.crack.") for key in geometry)
     if cracked and geometry.get("extra.crack.width_in_mm") != 0:
@@ -250,26 +244,20 @@ def detector_values(
         if key == "extra" or key.startswith("extra.crack"):
             continue
         if key not in _KEYS["diode"]:
-            raise CpunetError(
-                f"{source}: unknown key geometry.{key} (units belong to the key); "
-                "correct or remove it"
-            )
+            text = f"{source}: unknown key geometry.{key} (units belong to the key)"
+            raise CpunetError(text, "correct or remove it")
         values[_KEYS["diode"][key]] = value
     values.pop("", None)
-    outer, inner = (
-        _number_at(diode, f"geometry.groove.radius_in_mm.{side}", source, 0.0)
-        for side in ("outer", "inner")
-    )
+    radii = [f"geometry.groove.radius_in_mm.{side}" for side in ("outer", "inner")]
+    outer, inner = (_number_at(diode, place, source, 0.0) for place in radii)
     if geometry.get("groove.depth_in_mm"):
         values["ditch_thickness"] = outer - inner
     for field, places in _KEYS["measured"].items():
         reasons[field] = f"neither {' nor '.join(places)} is above 0"
         numbers = [_number_at(diode, place, source, 0.0) for place in places]
         if min(numbers) < 0:
-            raise CpunetError(
-                f"{source}: {places[numbers.index(min(numbers))]} is below 0",
-                "correct it, or write 0 for none",
-            )
+            text = f"{source}: {places[numbers.index(min(numbers))]} is below 0"
+            raise CpunetError(text, "correct it, or write 0 for none")
         if any(numbers):
             values[field] = next(filter(None, numbers))
     boule, cut = values["name"][:-1], values["name"][-1:]  # V99000 and A of V99000A
@@ -326,16 +314,12 @@ def impurity_values(
         raise CpunetError(f"{source}: no impurity_curve; {_ANOTHER}")
     model, models = curve.get("model"), _KEYS["impurity_curve"]
     if not isinstance(model, str) or model not in models:
-        raise CpunetError(
-            f"{source}: impurity_curve.model {model!r} is unknown; models are "
-            f"{', '.join(models)}; {_ANOTHER}"
-        )
-    numbers = dict.fromkeys("abcn", 0.0) | {
-        "a" if key == "value" else key: _number_at(
-            crystal, f"impurity_curve.parameters.{key}", source
-        )
-        for key in models[model]
-    }
+        text = f"{source}: impurity_curve.model {model!r} is unknown"
+        raise CpunetError(f"{text}; models are {', '.join(models)}", _ANOTHER)
+    numbers = dict.fromkeys("abcn", 0.0)
+    for key in models[model]:
+        value = _number_at(crystal, f"impurity_curve.parameters.{key}", source)
+        numbers["a" if key == "value" else key] = value
     a, b, c, n = (numbers[key] for key in "abcn")
     place = f"slices.{slice_name}.detector_offset_in_mm"
     contact = _number_at(crystal, place, source)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, Literal
@@ -14,10 +14,9 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import item_at, members, opened
-from cpunet.pulses.peaks import label_peaks
+from cpunet.pulses.peaks import Peaks, label_peaks
 from cpunet.pulses.reading.other_formats import read_arrays
 from cpunet.pulses.reading.source import whole_numbers
-from cpunet.recipes.schema import PeakConfig
 from cpunet.simulation.hit_steps import NEEDED, StepTable, roles
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.tables import Lines, counted, span
@@ -67,10 +66,8 @@ def read_hits(path: Path | str, options: HitOptions = HitOptions()) -> Hits:
                 f"{file}: holds detectors {names}; choose one with `hits_detector`"
             )
         if chosen is not None and not names:
-            raise CpunetError(
-                f"{file}: its hits name no detector to pick {chosen} by; leave out "
-                "`hits_detector`"
-            )
+            remedy = "leave out `hits_detector`"
+            raise CpunetError(f"{file}: its hits name no detector to pick {chosen} by", remedy)
         if chosen is not None and chosen not in detectors:
             raise CpunetError(f"{file}: no detector {chosen}; it holds {names}")
         return detectors[chosen or next(iter(detectors))].hits(options)
@@ -198,9 +195,7 @@ def hit_columns(hits: Hits) -> dict[str, tuple[npt.NDArray[Any], str]]:
     return {"event_number": (number, ""), **places, "edep": (hits.edep_kev, "keV")}
 
 
-def describe_hits(
-    path: Path, peaks: Mapping[str, PeakConfig], units: str = ""
-) -> dict[str, Lines]:
+def describe_hits(path: Path, peaks: Peaks, units: str = "") -> dict[str, Lines]:
     """Describe the hits of a file, detector by detector.
 
     Parameters

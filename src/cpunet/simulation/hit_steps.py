@@ -15,14 +15,7 @@ import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.hdf5_files import units_of
-from cpunet.pulses.reading.source import (
-    Texts,
-    divides,
-    dividing,
-    labels,
-    texts,
-    whole_numbers,
-)
+from cpunet.pulses.reading.source import Texts, divides, dividing, labels, texts, whole_numbers
 from cpunet.simulation.geometry import FloatArray, IntArray
 from cpunet.simulation.hits import HitOptions, Hits
 from cpunet.units import factor, unit_names
@@ -75,10 +68,8 @@ class StepTable:
         """
         of = roles(self.columns)
         if missing := [role for role in NEEDED if role not in of]:
-            raise CpunetError(
-                f"{self.path}: no column for {missing[0]}; "
-                f"the file holds {', '.join(self.columns)}"
-            )
+            text = f"no column for {missing[0]}; the file holds {', '.join(self.columns)}"
+            raise CpunetError(f"{self.path}: {text}")
         deposits = self._read(of["edep"][0])[0] > 0
         dividers = {name: self._read(name)[0] for name in self.columns if divides(name)}
         some = {name: values[deposits] for name, values in dividers.items()}

@@ -7,10 +7,10 @@ from collections import namedtuple
 from typing import TYPE_CHECKING, Any, TypeAlias, cast
 
 import numpy as np
-import numpy.typing as npt
+from numpy.typing import ArrayLike
 
 from cpunet.kernels import kernel
-from cpunet.simulation.geometry import Detector, FloatArray
+from cpunet.simulation.geometry import BoolArray, Detector, FloatArray, RegionArray
 
 POINT_CONTACT, LI_CONTACT, GERMANIUM, DITCH = 0, 1, 2, 5
 
@@ -32,9 +32,7 @@ def outline_of(detector: Detector) -> Outline:
     return cast("Outline", made(*(getattr(detector, name) for name in _VALUES)))
 
 
-def places(
-    detector: Detector, r: npt.ArrayLike, z: npt.ArrayLike
-) -> tuple[npt.NDArray[np.int8], npt.NDArray[np.bool_]]:
+def places(detector: Detector, r: ArrayLike, z: ArrayLike) -> tuple[RegionArray, BoolArray]:
     """`Detector.region` and `Detector.inside` at places of a detector."""
     r, z = np.broadcast_arrays(np.asarray(r, float), np.asarray(z, float))
     values = np.empty((2, r.size), np.int8)
@@ -43,7 +41,7 @@ def places(
 
 
 @kernel(error_model="numpy")
-def _fill(outline: Outline, r: FloatArray, z: FloatArray, values: npt.NDArray[np.int8]) -> None:
+def _fill(outline: Outline, r: FloatArray, z: FloatArray, values: RegionArray) -> None:
     """Region of each place, and 1 if it lies inside."""
     region, inside = values
     radius, length = outline.point_contact_radius, outline.point_contact_length

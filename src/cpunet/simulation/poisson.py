@@ -63,37 +63,25 @@ def make_grid(detector: Detector) -> Grid:
     CpunetError
         If ``grid_mm`` gives more nodes than fit into the memory.
     """
-    h = detector.grid_mm
-    nr, nz = (
-        int(np.ceil(size / h - 1e-6)) + 1
-        for size in (detector.crystal_radius, detector.crystal_length)
-    )
+    h, sizes = detector.grid_mm, (detector.crystal_radius, detector.crystal_length)
+    nr, nz = (int(np.ceil(size / h - 1e-6)) + 1 for size in sizes)
     if nr * nz > MAX_NODES:
-        raise CpunetError(
-            f"detector {detector.name}: grid_mm {h:g} makes {nr} x {nz} nodes; "
-            f"give a coarser one (at most {MAX_NODES} nodes)"
-        )
+        text = f"detector {detector.name}: grid_mm {h:g} makes {nr} x {nz} nodes"
+        raise CpunetError(text, f"give a coarser one (at most {MAX_NODES} nodes)")
     # rounded, so that 23 steps of 0.1 mm are exactly 2.3 mm
     r, z = (np.round(np.arange(n) * h, 9) for n in (nr, nz))
     rr, zz = np.meshgrid(r, z, indexing="ij")
     region = detector.region(rr, zz)
-    return Grid(
-        r_mm=r,
-        z_mm=z,
-        grid_mm=h,
-        region=region,
-        r_steps=_steps(detector, rr, zz, region),
-        z_steps=_steps(detector, rr.T, zz.T, region.T).T,
-    )
+    r_steps = _steps(detector, rr, zz, region)
+    z_steps = _steps(detector, rr.T, zz.T, region.T).T
+    return Grid(r_mm=r, z_mm=z, grid_mm=h, region=region, r_steps=r_steps, z_steps=z_steps)
 
 
-def _steps(
-    detector: Detector, rr: FloatArray, zz: FloatArray, region: RegionArray
-) -> FloatArray:
+def _steps(detector: Detector, r: FloatArray, z: FloatArray, region: RegionArray) -> FloatArray:
     """Fractions of the steps along the first axis that lie outside the contacts."""
     contact = region <= LI_CONTACT
     crossing = contact[:-1] != contact[1:]
-    nodes = np.stack([rr, zz])
+    nodes = np.stack([r, z])
     low, high = nodes[:, :-1][:, crossing], nodes[:, 1:][:, crossing]
     # start at the node outside the contact
     start, end = np.where(contact[:-1][crossing], [high, low], [low, high])
@@ -203,12 +191,11 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     diagonal[:, 0] += to_ground
     bands = [r_flux.ravel(), above.ravel()[:-1]]
     neighbours = sp.diags_array(2 * bands, offsets=(n_z, 1, -n_z, -1)).tocsr()
-    matrix = (sp.diags_array(diagonal.ravel()) - neighbours)[free.ravel()][:, free.ravel()]
+    rows = free.ravel()
+    matrix = (sp.diags_array(diagonal.ravel()) - neighbours)[rows][:, rows].tocsc()
     # symmetric and diagonally dominant: no pivoting, and an ordering that exploits it
     options = {"SymmetricMode": True}
-    factors = splu(
-        matrix.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
-    )
+    factors = splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options)
 
     def solved(boundary: FloatArray, charge: FloatArray) -> FloatArray:
         # potentials of contacts are given: their columns are moved to the right-hand side
@@ -222,9 +209,8 @@ def solve_potentials(detector: Detector, grid: Grid) -> Potentials:
     bias = solved((grid.region == LI_CONTACT).astype(float), nothing)
     impurity = detector.impurity_1e10_per_cm3(grid.r_mm[:, np.newaxis], grid.z_mm)
     impurities = solved(nothing, charges(detector, grid, impurity))
-    tilt = solved(
-        nothing, charges(detector, grid, (grid.z_mm - detector.crystal_length / 2) / 10)
-    )
+    unit_tilt = (grid.z_mm - detector.crystal_length / 2) / 10
+    tilt = solved(nothing, charges(detector, grid, unit_tilt))
     surface = nothing
     if detector.surface_charge_1e10_per_cm2:
         surface = solved(nothing, surface_charges(detector, grid))
@@ -333,9 +319,8 @@ def has_pocket(potential: FloatArray, region: RegionArray) -> bool:
     >>> has_pocket(z * 10.0, region), has_pocket((z - 4.0) ** 2, region)
     (False, True)
     """
-    minima = (potential <= minimum_filter(potential, size=3, mode="nearest")) & (
-        region == GERMANIUM
-    )
+    minima = potential <= minimum_filter(potential, size=3, mode="nearest")
+    minima &= region == GERMANIUM
     where = np.argwhere(minima)
     for row, column in where[np.argsort(potential[minima])]:  # a true pocket is deep
         start = potential[row, column]

@@ -109,9 +109,7 @@ class SimulationSettings(Config):
     @model_validator(mode="after")
     def _whole_steps(self) -> SimulationSettings:
         steps = [self.step_ns, *(s for s in _FINER_NS if s < self.step_ns)]
-        dividing = [
-            s for s in steps if abs(self.dt_ns / s - max(round(self.dt_ns / s), 1)) < 1e-9
-        ]
+        dividing = [s for s in steps if abs((n := self.dt_ns / s) - max(round(n), 1)) < 1e-9]
         if self.step_ns not in dividing:
             remedy = f"add step_ns={dividing[0]:g}" if dividing else "choose another"
             raise ValueError(

@@ -19,12 +19,11 @@ from cpunet.errors import CpunetError
 from cpunet.hdf5_files import opened
 from cpunet.outputs import refuse_inputs
 from cpunet.processes import usable_cores
-from cpunet.pulses.peaks import parse_selection
+from cpunet.pulses.peaks import Peaks, parse_selection
 from cpunet.pulses.provenance import MADE_BY, SIMULATION
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.pulses.writing import PulseWriter
 from cpunet.recipes import load_recipe
-from cpunet.recipes.schema import PeakConfig
 from cpunet.settings import Set, require_seed
 from cpunet.simulation.gammas import EnergyWindow, simulate_gammas
 from cpunet.simulation.geometry import Detector
@@ -50,7 +49,7 @@ _STRAY, _MISPLACED = 1e-3, 0.9
 
 
 def energy_windows(
-    names: str | Iterable[str], peaks: Mapping[str, PeakConfig], half_width_kev: float
+    names: str | Iterable[str], peaks: Peaks, half_width_kev: float
 ) -> list[EnergyWindow]:
     """Windows from ``"FEP,DEP"`` or ranges in keV such as ``"1500-1580"``.
 
@@ -70,6 +69,7 @@ def energy_windows(
 
     Examples
     --------
+    >>> from cpunet.recipes.schema import PeakConfig
     >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
     >>> [tuple(window) for window in energy_windows("FEP,1500-1580", lines, 0.5)]
     [('FEP', 2614.0, 2615.0), ('1500-1580', 1500.0, 1580.0)]
@@ -86,7 +86,7 @@ def energy_windows(
 
 
 def wanted_events(
-    events: str | Mapping[str, int], peaks: Mapping[str, PeakConfig], half_width_kev: float
+    events: str | Mapping[str, int], peaks: Peaks, half_width_kev: float
 ) -> dict[EnergyWindow, int]:
     """Windows, and the events wanted in each.
 
@@ -104,6 +104,7 @@ def wanted_events(
 
     Examples
     --------
+    >>> from cpunet.recipes.schema import PeakConfig
     >>> lines = {"FEP": PeakConfig(energy_kev=2614.5, half_width_kev=5)}
     >>> list(wanted_events("FEP=10,1500-1580=5", lines, 0.5).values())
     [10, 5]
@@ -233,18 +234,13 @@ class GammaSource:
         Each round has its own seed, so the events do not depend on the number of cores.
         """
         seeds = np.random.SeedSequence(self.seed).generate_state(rounds, np.uint64)
+        place = {"source_height_mm": self.height_mm, "source_radius_mm": self.radius_mm}
 
         def events_of(i: int) -> tuple[Hits, int]:
-            wanted = {
-                w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()
-            }
+            share = {w: n * (i + 1) // rounds - n * i // rounds for w, n in self.events.items()}
+            most = _GAMMAS_PER_EVENT * sum(share.values())
             return simulate_gammas(
-                detector,
-                source_height_mm=self.height_mm,
-                source_radius_mm=self.radius_mm,
-                n_primaries=_GAMMAS_PER_EVENT * sum(wanted.values()),
-                seed=int(seeds[i]),
-                wanted=wanted,
+                detector, n_primaries=most, seed=int(seeds[i]), wanted=share, **place
             )
 
         at_once, primaries = min(usable_cores(), _MAX_WORKERS, rounds), 0
@@ -402,10 +398,8 @@ def simulate(
         for before_merging, block in simulator.blocks(opened, f"Simulating {crystal.name}"):
             simulation.count(before_merging, block)
             seen = block.collected_kev > 0
-            columns: dict[str, tuple[Any, str]] = {
-                "lost_energy": (block.lost_kev[seen], "keV"),
-                "n_hits": (np.diff(block.hits.offsets)[seen], ""),
-            }
+            columns: dict[str, tuple[Any, str]] = {"lost_energy": (block.lost_kev[seen], "keV")}
+            columns["n_hits"] = np.diff(block.hits.offsets)[seen], ""
             if physics.electron_trapping_per_us or physics.hole_trapping_per_us:
                 columns["trapped_energy"] = (block.trapped_kev[seen], "keV")
             writer.append(block.pulses(), columns)
@@ -462,10 +456,8 @@ class StoredSimulation:
         with opened(file) as content:
             text = content[_PULSES].attrs.get("simulation") if _PULSES in content else None
             if text is None or HIT_TABLE not in content:
-                raise CpunetError(
-                    f"{file}: no {_PULSES} with its simulation, or no {HIT_TABLE}; give "
-                    "an output of cpunet simulate or of a test stand"
-                )
+                wrong = f"{file}: no {_PULSES} with its simulation, or no {HIT_TABLE}"
+                raise CpunetError(wrong, "give an output of cpunet simulate or of a test stand")
             numbers = np.asarray(content[f"{_PULSES}/event_number"][()])
         try:
             made = json.loads(text)

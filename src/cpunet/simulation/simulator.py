@@ -7,27 +7,27 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 from numba import prange
+from numpy.typing import ArrayLike, NDArray
 
 from cpunet.errors import CpunetError
 from cpunet.kernels import kernel
 from cpunet.progress import stage
 from cpunet.pulses.container import Pulses
-from cpunet.simulation.drift import (
-    BOLTZMANN_V_PER_K,
-    FWHM_PER_SIGMA,
-    REPULSION_PER_KEV,
-    SIGGEN_DIFFUSION,
-    SMALLEST_FWHM_MM,
-    drift,
-    smear_and_sample,
-)
+from cpunet.simulation.drift import FWHM_PER_SIGMA, drift, smear_and_sample
 from cpunet.simulation.drift_maps import ELECTRON, HOLE, DriftMaps, drift_maps, in_active_volume
 from cpunet.simulation.fields import FieldMaps, compute_fields
 from cpunet.simulation.geometry import BoolArray, Detector, FloatArray, IntArray
 from cpunet.simulation.hits import Hits, OpenHits
 from cpunet.simulation.settings import SimulationSettings
+
+# 2.355**2 times 0.12 V mm/cm, as rounded in siggen
+SIGGEN_DIFFUSION = 0.67
+BOLTZMANN_V_PER_K = 8.617333e-5
+# siggen's self-repulsion of a cloud of 1 keV: 0.003 keV per electron-hole pair, a relative
+# permittivity of 16, and its rounded FWHM per sigma
+REPULSION_PER_KEV = 1.0 / 0.003 / 6.241e18 * 0.67**3 * 9e13 / 16 * 2.355**3
+SMALLEST_FWHM_MM = 0.01  # initial FWHM of a cloud that grows, at least
 
 _CHUNK = 25  # events per task of a thread
 _QUICK_STRIDE = 5  # most time steps that a step of the drift of quick pulses replaces
@@ -108,7 +108,7 @@ class EventPulses:
         Energy in keV of each event that gives a signal, which is what a detector measures.
     """
 
-    waveforms: npt.NDArray[np.float32]
+    waveforms: NDArray[np.float32]
     dt_ns: float
     hits: Hits
     valid: BoolArray
@@ -122,12 +122,10 @@ class EventPulses:
 
     def pulses(self) -> Pulses:
         """Events with a signal as `Pulses`, with their collected energies."""
-        with_signal = self.collected_kev > 0
+        seen = self.collected_kev > 0
+        kev, numbers = self.collected_kev[seen], self.hits.event_number[seen]
         return Pulses.of(
-            self.waveforms[with_signal],
-            dt_ns=self.dt_ns,
-            energy_kev=self.collected_kev[with_signal],
-            event_number=self.hits.event_number[with_signal],
+            self.waveforms[seen], dt_ns=self.dt_ns, energy_kev=kev, event_number=numbers
         )
 
 
@@ -235,11 +233,7 @@ class Simulator:
         )
 
     def signals(
-        self,
-        x_mm: npt.ArrayLike,
-        y_mm: npt.ArrayLike,
-        z_mm: npt.ArrayLike,
-        edep_kev: npt.ArrayLike,
+        self, x_mm: ArrayLike, y_mm: ArrayLike, z_mm: ArrayLike, edep_kev: ArrayLike
     ) -> EventPulses:
         """Pulse of each hit, in units of its charge.
 
@@ -315,7 +309,7 @@ class Simulator:
                 bar.update(len(hits))
 
     def paths(
-        self, x_mm: npt.ArrayLike, y_mm: npt.ArrayLike, z_mm: npt.ArrayLike
+        self, x_mm: ArrayLike, y_mm: ArrayLike, z_mm: ArrayLike
     ) -> tuple[FloatArray, FloatArray]:
         """Trajectories of both carriers from each starting point in mm.
 
@@ -344,7 +338,7 @@ def _sum_events(
     offsets: IntArray,
     task: Task,
     weighted: bool,
-    waveforms: npt.NDArray[np.float32],
+    waveforms: NDArray[np.float32],
     facts: FloatArray,
 ) -> None:
     """Fill the pulses of events, and the facts of hits with a signal.
@@ -399,11 +393,7 @@ def _sum_events(
 
 @kernel
 def _merge(
-    position: FloatArray,
-    energy: FloatArray,
-    offsets: IntArray,
-    alone: BoolArray,
-    distance2: float,
+    position: FloatArray, energy: FloatArray, offsets: IntArray, alone: BoolArray, near2: float
 ) -> tuple[FloatArray, IntArray]:
     """Clusters as rows (x, y, z, energy), and the offsets of the events."""
     merged = np.zeros((len(energy), 4))
@@ -429,7 +419,7 @@ def _merge(
                     square = 0.0
                     for axis in range(3):
                         square += (position[mine, axis] - position[other, axis]) ** 2
-                    if square <= distance2:
+                    if square <= near2:
                         label[other] = n
                         queue[waiting] = other
                         waiting += 1

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from cpunet.pulses.parameters import Values
+from cpunet.pulses.parameters import Values, shorth
 from cpunet.validation.comparisons import ByMethod, Missing, Number, Result, finite_values
 
 Range = tuple[float, float]
@@ -159,13 +159,9 @@ def range_survival(
     n, n_side = len(inside), len(sides)
     passing, side_pass = (len(v) - np.searchsorted(v, cuts) for v in (inside, sides))
     p, s, total = int(passing[0]), int(side_pass[0]), n - scale * n_side
+    undefined = len(events) + len(background) - n - n_side
     result = RangeSurvival(
-        peak=n,
-        peak_pass=p,
-        sideband=n_side,
-        sideband_pass=s,
-        scale=scale,
-        undefined=len(events) + len(background) - n - n_side,
+        peak=n, peak_pass=p, sideband=n_side, sideband_pass=s, scale=scale, undefined=undefined
     )
     if not np.isfinite(cuts[0]):
         result.missing = "there is no cut: too few events of the double-escape peak"
@@ -302,9 +298,6 @@ def dep_scales(dep_ae: Mapping[str, Values], seed: int = 0) -> dict[str, tuple[f
     seed
         Seed of the bootstraps.
     """
-    # half of SciPy, which those who only read scores need not wait for
-    from cpunet.electronics.baseline_methods import shorth
-
     finite = {method: finite_values(values) for method, values in dep_ae.items()}
     if not all(values.size >= MIN_EVENTS for values in finite.values()):
         return {}

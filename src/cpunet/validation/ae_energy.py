@@ -14,6 +14,7 @@ import numpy as np
 from pydantic import Field
 from scipy.special import expit, log_ndtr, ndtr
 
+from cpunet.pulses.container import shortest
 from cpunet.pulses.parameters import Values
 from cpunet.validation.a_over_e import DEP, Range
 from cpunet.validation.comparisons import Result, finite_values
@@ -207,8 +208,7 @@ def site_fit(
             return None
         # the middle of the shortest interval with a fifth of the values
         n = max(20, len(values) // 5)
-        first = int((values[n - 1 :] - values[: len(values) - n + 1]).argmin())
-        centre = float(np.median(values[first : first + n]))
+        centre = float(np.median(shortest(values, n)))
         above = values[values > centre] - centre
         about = centre, float(np.quantile(above, 0.68)) if len(above) >= 10 else 0.0
     centre, width = about

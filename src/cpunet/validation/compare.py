@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -162,10 +162,9 @@ class Comparison:
         peaks = {row.peak: [r for r in self.rows if r.peak == row.peak] for row in self.rows}
         title = f"{label(self.method)}: {len(self.reports)} runs compared"
         values = {"title": title, "comparison": self, "links": links, "peaks": peaks}
+        html = rendered("compare.html", **values, far=f"{FAR:g}")
         with written_aside(path) as aside:
-            aside.write_text(
-                rendered("compare.html", **values, far=f"{FAR:g}"), encoding="utf-8"
-            )
+            aside.write_text(html, encoding="utf-8")
 
     def __str__(self) -> str:
         lines = []
@@ -240,10 +239,7 @@ def compare(
 
 
 def compared(
-    reports: Sequence[str | Path | Report],
-    *,
-    method: str = "ren",
-    failed: Collection[Path] = (),
+    reports: Sequence[str | Path | Report], *, method: str = "ren", failed: Sequence[Path] = ()
 ) -> Comparison:
     """Compare the scores of several validations, see `compare`.
 
@@ -264,21 +260,28 @@ def compared(
         file = next((f for f in files if f.is_file() and path not in failed), None)
         stored = Report(read_metrics(file), folder=file.parent) if file else None
         opened.append((path, stored))
-    places = [place for place, _ in opened]
-    named = {name: of for name, (_, of) in zip(_names(places), opened, strict=True)}
+    # by its folder, with as many parent folders as make it unique, without those at the end
+    # that all reports share, such as ``report``
+    places = [place.resolve() for place, _ in opened]
+    parts = [(path.parent if path.is_file() else path).parts for path in places]
+    while len(set(parts)) == len(parts) > 1 and len({part[-1] for part in parts}) == 1:
+        parts = [part[:-1] for part in parts]
+    for depth in range(1, max(map(len, parts), default=1) + 1):
+        names = [str(Path(*part[-depth:])) for part in parts]
+        if len(set(names)) == len(names):
+            break
+    else:  # names that are still equal refer to the same report
+        names = [f"{part[-1]} ({i})" for i, part in enumerate(parts, start=1)]
+    named = {name: of for name, (_, of) in zip(names, opened, strict=True)}
     runs = {name: report for name, report in named.items() if report is not None}
     if not runs:
-        raise CpunetError(
-            f"none of the {len(reports)} reports is there",
-            "give folders of cpunet validate or cpunet demo",
-        )
+        remedy = "give folders of cpunet validate or cpunet demo"
+        raise CpunetError(f"none of the {len(reports)} reports is there", remedy)
     made = Comparison(method, runs, tuple(name for name in named if name not in runs))
     if not made.rows:
         methods = _union(s.methods for of in runs.values() for s in of.metrics.peaks.values())
-        raise CpunetError(
-            f"{', '.join(runs)}: no score of the method {method}; "
-            + (f"there are {', '.join(methods)}" if methods else "nothing is scored there")
-        )
+        others = f"there are {', '.join(methods)}" if methods else "nothing is scored there"
+        raise CpunetError(f"{', '.join(runs)}: no score of the method {method}; {others}")
     return made
 
 
@@ -309,20 +312,3 @@ def _scores(metrics: Metrics, peak: str, method: str) -> dict[str, Cell]:
 def _union(names: Iterable[Iterable[str]]) -> list[str]:
     """All names in the order of their first occurrence."""
     return list(dict.fromkeys(name for some in names for name in some))
-
-
-def _names(reports: Sequence[Path]) -> list[str]:
-    """Name each report by its folder, with as many parent folders as make it unique.
-
-    Folders at the end that all reports share, such as ``report``, are left out.
-    """
-    given = [report.resolve() for report in reports]
-    parts = [(path.parent if path.is_file() else path).parts for path in given]
-    while len(set(parts)) == len(parts) > 1 and len({part[-1] for part in parts}) == 1:
-        parts = [part[:-1] for part in parts]
-    for depth in range(1, max(map(len, parts), default=1) + 1):
-        names = [str(Path(*part[-depth:])) for part in parts]
-        if len(set(names)) == len(names):
-            return names
-    # names that are still equal refer to the same report
-    return [f"{part[-1]} ({i})" for i, part in enumerate(parts, start=1)]

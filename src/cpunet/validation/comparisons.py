@@ -21,9 +21,9 @@ from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import Annotated, Any
 
-import hist
 import numpy as np
 import numpy.typing as npt
+from hist.axis import Regular
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field
 
 from cpunet.pulses.parameters import Values
@@ -269,9 +269,7 @@ def drawn_distances(a: Values, b: Values, draws: Sequence[Resampled], nodes: int
     return np.asarray(np.diff(positions) @ heights)
 
 
-def histogram(
-    values: Values, axis: hist.axis.Regular, drawn: Resampled | None = None
-) -> Histogram:
+def histogram(values: Values, axis: Regular, drawn: Resampled | None = None) -> Histogram:
     """Counts of all values: underflow, the bins, overflow, and the NaNs last.
 
     Parameters
@@ -286,7 +284,7 @@ def histogram(
     Examples
     --------
     >>> import numpy as np
-    >>> axis = hist.axis.Regular(2, 0, 2)
+    >>> axis = Regular(2, 0, 2)
     >>> histogram(np.array([-1, 0.5, 1.5, 1.6, np.inf, np.nan]), axis)
     array([1., 1., 2., 1., 1.])
     """
@@ -436,15 +434,13 @@ def compare(
     sizes = {m: len(next(iter(values.values()))) for m, values in methods.items()}
     n_sim = max(sizes.values(), default=0)
     null = [Resampled(n_data, n, scores.bootstraps, rng) for n in (n_sim, n_data)]
-    axes: dict[str, hist.axis.Regular | None] = {}
+    axes: dict[str, Regular | None] = {}
     results: dict[str, dict[str, Any]] = {}
     for name, values in data.items():
         distances = drawn_distances(values, values, null, NULL_NODES)
-        result = results[name] = {
-            "wasserstein_null": distances.mean(),
-            "wasserstein_null_std": distances.std(),
-            "missing": {"data": int(np.isnan(values).sum())},
-        }
+        result = results[name] = {"missing": {"data": int(np.isnan(values).sum())}}
+        result["wasserstein_null"] = distances.mean()
+        result["wasserstein_null_std"] = distances.std()
         ceilings, finite, axis = np.full(1, np.nan), finite_values(values), None
         if finite.size:
             axis = data_axis(values, scores.max_bins)
@@ -461,9 +457,8 @@ def compare(
         for name, result in results.items():
             both, axis = (data[name], by_name[name]), axes[name]
             ends = moved.get(method, {}).get(name)
-            of_method: dict[str, Any] = dict(
-                zip(("chi_square", "degrees", "p"), two_sample_test(*both, ends), strict=True)
-            )
+            chi_square, degrees, p = two_sample_test(*both, ends)
+            of_method: dict[str, Any] = {"chi_square": chi_square, "degrees": degrees, "p": p}
             of_method["shift"], of_method["shift_std"] = shift(*both, ends)
             of_method["wasserstein"] = wasserstein(*both)
             of_method["wasserstein_std"] = drawn_distances(*both, draws, NODES).std()

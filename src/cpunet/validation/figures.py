@@ -8,8 +8,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-import hist
 import numpy as np
+from hist.axis import Regular
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
@@ -67,11 +67,7 @@ def cycle_figure(pulses: Mapping[str, FloatArray], dt_ns: float) -> Figure:
 
 @styled
 def parameter_histograms(
-    values: Mapping[str, Values],
-    axis: hist.axis.Regular,
-    parameter: str,
-    peak: str,
-    comparison: Compared,
+    values: Mapping[str, Values], axis: Regular, parameter: str, peak: str, comparison: Compared
 ) -> Figure:
     """Distributions of one parameter at a peak, and differences from the data in sigma.
 
@@ -139,11 +135,7 @@ def overlap_figure(metrics: Metrics) -> Figure:
 
 @styled
 def draw_parameter(
-    axes: Axes,
-    values: Mapping[str, Values],
-    axis: hist.axis.Regular,
-    parameter: str,
-    comparison: Compared,
+    axes: Axes, values: Mapping[str, Values], axis: Regular, parameter: str, compared: Compared
 ) -> None:
     """Draw the distributions of one parameter: the data filled, each method as a line.
 
@@ -160,12 +152,12 @@ def draw_parameter(
         Binning, see `shape_parameters.data_axis`.
     parameter
         Name of the parameter in `PARAMETERS`.
-    comparison
+    compared
         Result of `comparisons.compare` for the parameter.
     """
     for method, of_method in values.items():
         name, kind = ("ceiling", "data vs data") if method == "data" else (method, "IoU")
-        score, missing = comparison.iou.get(name), int(np.isnan(of_method).sum())
+        score, missing = compared.iou.get(name), int(np.isnan(of_method).sum())
         text = label(method) + ("" if score is None else f" ({kind} {score:.1f} %)")
         text += f", n = {len(of_method)}" + (f", {missing} undefined" if missing else "")
         below, *shares, above, _ = histogram(of_method, axis) / max(len(of_method), 1)
@@ -341,13 +333,9 @@ def spectrum_of_noise(spectra: Mapping[str, Spectrum], peak: str) -> Figure:
             usual = np.where(data > 0, data, np.nan)
             points(below, spectrum.frequency_mhz, power / usual, error / usual, method, **look)
     below.axhline(1, color="black", linewidth=0.8)
-    silent = not any(any(spectrum.power) for spectrum in drawn.values())
-    above.set(
-        title=f"{peak}: noise before the pulse",
-        ylabel="Mean square per band\n[pulse height²]",
-        xscale="log",
-        yscale="linear" if silent else "log",
-    )
+    scale = "log" if any(any(of.power) for of in drawn.values()) else "linear"
+    above.set(title=f"{peak}: noise before the pulse", xscale="log", yscale=scale)
+    above.set_ylabel("Mean square per band\n[pulse height²]")
     above.legend()
     for axis in (above.yaxis, below.xaxis):
         axis.set_major_formatter("{x:g}")  # powers as formulas take long to set

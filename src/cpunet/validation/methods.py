@@ -20,7 +20,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.electronics.baseline_methods import BASELINE_METHODS, BaselineMethod
 from cpunet.electronics.baseline_noise import BaselineNoise
@@ -29,7 +28,7 @@ from cpunet.electronics.measured import noise_of, tails_of
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
 from cpunet.progress import stage
-from cpunet.pulses.container import FloatArray, Pulses, blocks
+from cpunet.pulses.container import Flags, FloatArray, Pulses, blocks
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
@@ -38,8 +37,6 @@ from cpunet.translation.translator import REN
 from cpunet.validation.metrics import PairedScores
 
 log = logging.getLogger(__name__)
-
-Flags = npt.NDArray[np.bool_]
 
 
 def true_responses(path: Path, sim: InputSet) -> FloatArray:
@@ -125,10 +122,8 @@ def scores_of_squares(squares: Values) -> PairedScores:
     >>> round(scores_of_squares(squares["ren"]).rmse, 6)
     0.0
     """
-    rmse, edge_rmse = (
-        np.sqrt(total / count) if count else None
-        for total, count in squares.sum(axis=0).reshape(2, 2)
-    )
+    sums = squares.sum(axis=0).reshape(2, 2)
+    rmse, edge_rmse = (np.sqrt(total / count) if count else None for total, count in sums)
     unaligned = int((squares[:, 1] == 0).sum())
     return PairedScores(rmse=rmse, edge_rmse=edge_rmse, unaligned=unaligned)
 
@@ -234,12 +229,10 @@ class Translations:
     def without_noise(self, row: int) -> dict[str, FloatArray]:
         """Noise-free window of a pulse by method, with the truth if given."""
         raw, config = self.windows["raw"][[row]], self.ren.recipe.preparation
-        windows = {"raw": raw}
+        windows, kev = {"raw": raw}, self.energy_kev["raw"][[row]]
         for name, method in self.baselines.methods.items():
             windows[name] = finish(method.translate(raw), config, dt_ns=self.ren.dt_ns).windows
-        windows["ren"] = self.ren.apply(
-            raw, energy_kev=self.energy_kev["raw"][[row]], noise=False
-        )
+        windows["ren"] = self.ren.apply(raw, energy_kev=kev, noise=False)
         return windows if self.truth is None else windows | {"truth": self.truth[[row]]}
 
 
@@ -268,7 +261,8 @@ def translate_all(
     given = {} if responses is None else {"truth": responses}
     others = [*baselines.methods, *given]
     # all methods get the same noise
-    generator, *rngs = (np.random.default_rng(seed) for _ in ("ren", *others))
+    generator = np.random.default_rng(seed)
+    rngs = {name: np.random.default_rng(seed) for name in others}
 
     def finished(name: str, rows: slice, rng: np.random.Generator) -> Finished:
         method, raw = baselines.methods.get(name), pulses.waveforms[rows]
@@ -282,19 +276,16 @@ def translate_all(
     with stage("Translating", len(pulses)) as bar, ThreadPoolExecutor(usable_cores()) as pool:
         for rows in blocks(len(pulses)):
             block = pulses[rows]
-            done = [
-                pool.submit(finished, n, rows, rng) for n, rng in zip(others, rngs, strict=True)
-            ]
+            done = {n: pool.submit(finished, n, rows, rng) for n, rng in rngs.items()}
             clean = {"raw": block.waveforms}
-            for name, translated in zip(others, done, strict=True):
+            for name, translated in done.items():
                 clean[name] = translated.result().clean
                 if noise is not None:
                     noisy[name].append(translated.result().windows)
             clean["ren"] = ren.apply(block.waveforms, energy_kev=block.energy_kev, noise=False)
             noisy["ren"].append(like_data(ren, block, generator))
-            comparable.append(
-                np.all([np.isfinite(w).all(axis=1) for w in clean.values()], axis=0)
-            )
+            finite = [np.isfinite(windows).all(axis=1) for windows in clean.values()]
+            comparable.append(np.all(finite, axis=0))
             if responses is not None:
                 truth.append(clean.pop("truth"))
                 edge = recipe.scores.samples(recipe.scores.edge_ns)
@@ -306,25 +297,18 @@ def translate_all(
     for name in (*baselines.methods, "ren", "truth"):  # from the simplest to the truth
         if name in noisy:
             every[name] = np.concatenate(noisy.pop(name))
-    return Translations(
-        ren,
-        baselines,
-        every,
-        {m: np.asarray(np.isfinite(windows).all(axis=1)) for m, windows in every.items()},
-        {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every},
-        {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()},
-        np.concatenate(comparable),
-        {method: np.concatenate(of_method) for method, of_method in squares.items()},
-        np.concatenate(truth) if truth else None,
-    )
+    whole = {m: np.asarray(np.isfinite(w).all(axis=1)) for m, w in every.items()}
+    kev = {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every}
+    amplitudes = {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()}
+    of_pairs = {method: np.concatenate(of_method) for method, of_method in squares.items()}
+    of_all, shapes = np.concatenate(comparable), np.concatenate(truth) if truth else None
+    return Translations(ren, baselines, every, whole, kev, amplitudes, of_all, of_pairs, shapes)
 
 
 def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> FloatArray:
     """Translated windows with noise and pile-up tails as those of the data."""
     tails = ren.tails if ren.tails is not None and ren.tails.rate_khz > 0 else None
+    kev = None if tails is None else tails.draw_kev(len(pulses), generator)
     return ren.apply(
-        pulses.waveforms,
-        energy_kev=pulses.energy_kev,
-        generator=generator,
-        tails_kev=None if tails is None else tails.draw_kev(len(pulses), generator),
+        pulses.waveforms, energy_kev=pulses.energy_kev, generator=generator, tails_kev=kev
     )

@@ -214,16 +214,11 @@ class Metrics(Result):
 
     def to_dict(self) -> dict[str, Any]:
         """What the file has: the numbers, and verdicts in words."""
-        table = {
-            peak: {
-                method: {
-                    quantity: {key: getattr(v, key) for key in WRITTEN}
-                    for quantity, v in self.judge(peak, method).items()
-                }
-                for method in scores.methods
-            }
-            for peak, scores in self.peaks.items()
-        }
+        table: dict[str, dict[str, Any]] = {peak: {} for peak in self.peaks}
+        for peak, scores in self.peaks.items():
+            for method in scores.methods:
+                own = self.judge(peak, method).items()
+                table[peak][method] = {q: {k: getattr(v, k) for k in WRITTEN} for q, v in own}
         words = {"summary": [self.summary(peak) for peak in self.scored], "table": table}
         return {**self.model_dump(mode="json", exclude_unset=True), "verdicts": words}
 
@@ -259,10 +254,8 @@ class Metrics(Result):
             aucs = np.clip((tested.auc, null, tested.null_mean), LEAST_AUC, 1 - LEAST_AUC)
             place, expected, least = ndtri(aucs) / QUANTILE_SLOPE
             if std:
-                spread = math.hypot(std, expected - least)
-                p = stdtr(
-                    SHUFFLES - 1, (expected - place) / (spread * math.sqrt(1 + 1 / SHUFFLES))
-                )
+                spread = math.hypot(std, expected - least) * math.sqrt(1 + 1 / SHUFFLES)
+                p = stdtr(SHUFFLES - 1, (expected - place) / spread)
             more, std = tested.auc - null, math.hypot(std, tested.of_fit)
             words = f"AUC {with_std(tested.auc, std)}, {null:.2f} expected"
             data = with_std(null, std)
@@ -362,9 +355,8 @@ class Metrics(Result):
                 if name not in verdicts or (p := verdicts[name].p) is None:
                     continue
                 compared = judged.get(name, Compared())
-                unit = (
-                    "%" if name == SURVIVAL else LABELLED[name].unit if name in judged else ""
-                )
+                own = LABELLED[name].unit if name in judged else ""
+                unit = "%" if name == SURVIVAL else own
                 rows.append([
                     *(peak, f"{QUANTITIES[name]} [{unit}]" if unit else QUANTITIES[name]),
                     verdicts[name].of_data,

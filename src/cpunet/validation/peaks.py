@@ -31,11 +31,10 @@ from dataclasses import dataclass, field, replace
 from typing import Self
 
 import numpy as np
-import numpy.typing as npt
 
 from cpunet.errors import CpunetError
 from cpunet.processes import usable_cores
-from cpunet.pulses.container import FloatArray, Pulses
+from cpunet.pulses.container import FloatArray, Pulses, Rows
 from cpunet.pulses.parameters import PARAMETERS, Values, align_half_maximum, pulse_parameters
 from cpunet.pulses.peaks import parse_selection
 from cpunet.pulses.shape_parameters import A_OVER_E, all_parameters
@@ -55,7 +54,6 @@ MIN_PULSES = 10  # minimum number of pulses of a distribution
 MOVED = 300  # pulses of a peak, for which the errors of a fit are calculated
 FIT_DRAWS = 8  # of the parameters, for the classifier
 
-Rows = npt.NDArray[np.int64]
 ByMethod = dict[str, dict[str, Values]]
 Ends = Sequence[tuple[REN, REN]]
 
@@ -215,9 +213,8 @@ def score_peak(
     """
     of_all, raw, data = peak.translations, peak.rows["raw"], peak.rows["data"]
     lost = {m: int((~whole[raw]).sum()) for m, whole in of_all.whole.items() if m != "data"}
-    result = PeakScores(
-        n_sim=len(raw), n_data=len(data), not_prepared={m: n for m, n in lost.items() if n}
-    )
+    lost = {m: n for m, n in lost.items() if n}
+    result = PeakScores(n_sim=len(raw), n_data=len(data), not_prepared=lost)
     sides = (("simulated", raw), ("measured", data))
     few = [f"{len(rows) or 'no'} {side}" for side, rows in sides if len(rows) < MIN_PULSES]
     if few:
@@ -253,11 +250,10 @@ def score_peak(
 
     def classified(method: str) -> TwoSample | Missing:
         both = ("data", method)
-        chief = [{n: values[m][n] for n in PARAMETERS} for m in both]
+        of_data, of_method = ({n: values[m][n] for n in PARAMETERS} for m in both)
+        features = of_data, of_method
         try:
-            return classifier_auc(
-                *map(peak.windows, both), seed=seed, features=(chief[0], chief[1])
-            )
+            return classifier_auc(*map(peak.windows, both), seed=seed, features=features)
         except CpunetError as error:
             return Missing(missing=str(error))
 
@@ -266,12 +262,9 @@ def score_peak(
     if ends and isinstance(tested := result.two_sample["ren"], TwoSample):
         result.two_sample["ren"] = replace(tested, of_fit=classifier_excess(peak, ends, seed))
     samples, before = recipe.preparation.baseline_samples, recipe.preparation.samples_before
-    result.noise = baseline_spectra(
-        {m: of_all.windows[m][rows, :samples] for m, rows in peak.rows.items()},
-        {m: before + of_method["t01"] / dt_ns for m, of_method in values.items()},
-        samples,
-        dt_ns,
-    )
+    windows = {m: of_all.windows[m][rows, :samples] for m, rows in peak.rows.items()}
+    begins = {m: before + of_method["t01"] / dt_ns for m, of_method in values.items()}
+    result.noise = baseline_spectra(windows, begins, samples, dt_ns)
     if of_all.squares:
         rows = peak.known_to_all()
         result.paired = {m: scores_of_squares(of[rows]) for m, of in of_all.squares.items()}

@@ -253,13 +253,8 @@ class Report:
         metrics = self.metrics
         text = json.dumps(self.to_dict(), indent=2, allow_nan=False, ensure_ascii=False)
         (folder / METRICS).write_text(text + "\n", encoding="utf-8")
-        parameters = {
-            f"{peak}/{method}/{name}": of_method[name]
-            for peak, of_peak in self.values.items()
-            for method, of_method in of_peak.items()
-            for name in of_method
-        }
-        np.savez_compressed(folder / VALUES, allow_pickle=False, **parameters)
+        arrays: dict[str, Any] = dict(flat(self.values, "/"))
+        np.savez_compressed(folder / VALUES, allow_pickle=False, **arrays)
 
         placed: dict[str, dict[str, Markup]] = {place: {} for place, _, _ in SECTIONS}
         with stage("Drawing", len(self.drawn)) as bar:
@@ -267,9 +262,8 @@ class Report:
                 stem = re.sub(r"[^\w.-]+", "_", name)  # file systems refuse some characters
                 caption = name.replace("_", " ")
                 place, _, shows = next(of for of in SECTIONS if caption.endswith(of[1]))
-                placed[place][name] = figure_html(
-                    caption, draw(), folder / f"{stem}.svg", shows
-                )
+                svg = folder / f"{stem}.svg"
+                placed[place][name] = figure_html(caption, draw(), svg, shows)
                 bar.update(1)
         # of each method that is drawn, for the page's legend
         drawn = "".join(html for of_place in placed.values() for html in of_place.values())
@@ -327,10 +321,7 @@ class Report:
             for parameter, compared in scores.parameters.items()
         }
         shown = [m for m in methods if any(m in iou for iou in of_all.values())]
-        rows = [
-            [*place, *(number(iou.get(m), ".1f") for m in shown)]
-            for place, iou in of_all.items()
-        ]
+        rows = [[*k, *(number(iou.get(m), ".1f") for m in shown)] for k, iou in of_all.items()]
         return ["peak", "parameter", *(_NAMES.get(m, m) for m in shown)], rows
 
 

@@ -110,16 +110,11 @@ def tune(
     begun = {"recipe": recipe.model_dump(mode="json"), "peak": peak, "seed": seed}
     begun |= {"space": {key: str(of) for key, of in space.items()}}
     begun |= {"simulation": job.sim.fingerprint(), "data": job.data.fingerprint()}
-    study = optuna.create_study(
-        study_name="cpunet",
-        storage=JournalStorage(JournalFileBackend(str(out / JOURNAL))),
-        load_if_exists=True,
-    )
+    storage = JournalStorage(JournalFileBackend(str(out / JOURNAL)))
+    study = optuna.create_study(study_name="cpunet", storage=storage, load_if_exists=True)
     for difference in differences(study.user_attrs.get(BEGUN, begun), begun):
-        raise CpunetError(
-            f"{out}: was begun with other settings or pulses: {difference}; give the same, or "
-            "choose another name"
-        )
+        text = f"{out}: was begun with other settings or pulses: {difference}"
+        raise CpunetError(text, "give the same, or choose another name")
     study.set_user_attr(BEGUN, begun)
     if own and not study.trials:
         study.enqueue_trial(own)
@@ -128,11 +123,9 @@ def tune(
         while (done := len(study.get_trials(states=ended))) < trials:
             bar.update(done - bar.n)
             # processes that share a search draw other random settings
-            number = len(study.trials)
+            own_seed = (seed + len(study.trials)) % 2**32
             study.sampler = optuna.samplers.GPSampler(
-                seed=(seed + number) % 2**32,
-                n_startup_trials=STARTS,
-                warn_independent_sampling=False,
+                seed=own_seed, n_startup_trials=STARTS, warn_independent_sampling=False
             )
             trial = study.ask(dict(space))
             try:
@@ -155,9 +148,8 @@ def _write_best(out: Path, study: Study, recipe: Recipe) -> None:
         raise CpunetError(f"{out}: no trial has a score; the first: {first}")
     best = study.best_trial
     description = f"{recipe.description}; tuned, trial {best.number}"
-    tuned = read_settings(Recipe, recipe, best.params).model_copy(
-        update={"name": f"{recipe.name}-tuned", "description": description}
-    )
+    named = {"name": f"{recipe.name}-tuned", "description": description}
+    tuned = read_settings(Recipe, recipe, best.params).model_copy(update=named)
     with written_aside(out / BEST) as aside:
         aside.write_text(yaml_text(tuned.model_dump(mode="json")), encoding="utf-8")
 
@@ -234,10 +226,7 @@ class HeldOut:
         values = pulse_parameters(held[1], job.recipe.preparation, job.recipe.scores)
         rng, sizes = np.random.default_rng(job.seed), [len(pulses) for pulses in held]
         draws = [Resampled(sizes[1], n, job.recipe.scores.bootstraps, rng) for n in sizes]
-        nulls = {
-            name: float(drawn_distances(v, v, draws, NULL_NODES).mean())
-            for name, v in values.items()
-        }
+        nulls = {k: drawn_distances(v, v, draws, NULL_NODES).mean() for k, v in values.items()}
         return cls(job, held[0], held[1], values, nulls)
 
     def score(self, ren: REN) -> float:

@@ -128,13 +128,11 @@ def validate(
     return Outcome({n: Report.load(place) for n, place in outcome.done.items()}, outcome.failed)
 
 
-def _of_channel(
-    runs: RunLike, how: dict[str, Any], name: str, pair: Pair, folder: Path
-) -> Path:
+def _of_channel(runs: RunLike, how: dict[str, Any], name: str, pair: Pair, out: Path) -> Path:
     """The folder of the report of a channel, made in a process of its own."""
     run = runs if isinstance(runs, Run) else own_folder(Path(runs), name, INFO)
-    _validated(used_run(run), pair, folder, **how)
-    return folder
+    _validated(used_run(run), pair, out, **how)
+    return out
 
 
 def _validated(
@@ -231,34 +229,22 @@ def evaluate(
     name = "current_amplitude"
     ae = {p.name: {m: v[name] for m, v in p.values.items()} for p in sets if p.values}
     if not ae:
-        raise CpunetError(
-            f"{data_set.path}: no peak has pulses on both sides",
-            "check the calibration (`kev_per_adc`, `data_energy`)",
-        )
-    survival, ranges = survivals(
-        ae,
-        amplitudes,
-        energy_kev,
-        bands,
-        {peak.name: peak.moved[name] for peak in sets if peak.moved},
-        seed,
-    )
+        remedy = "check the calibration (`kev_per_adc`, `data_energy`)"
+        raise CpunetError(f"{data_set.path}: no peak has pulses on both sides", remedy)
+    moved = {peak.name: peak.moved[name] for peak in sets if peak.moved}
+    survival, ranges = survivals(ae, amplitudes, energy_kev, bands, moved, seed)
+    both = {method: amplitudes[method] for method in ("data", "ren")}
+    lines = {peak: bands[peak][0] for peak in recipe.peaks}
+    fitted = {name: of.values for name, of in fits.methods.items()}
     tails = None if run.fit is None else run.fit.tails
     metrics = Metrics(
         compared=_compared(run, sim_set, data_set),
         peaks=peaks,
         ae_survival=survival,
         ae_details={"survival by energy range": ranges},
-        ae_energy=against_energy(
-            {method: amplitudes[method] for method in ("data", "ren")},
-            energy_kev,
-            {peak: bands[peak][0] for peak in recipe.peaks},
-        ),
+        ae_energy=against_energy(both, energy_kev, lines),
         a_over_e_scale=scales,
-        baseline_methods={
-            "fits": {name: of.values for name, of in fits.methods.items()},
-            "missing": fits.missing,
-        },
+        baseline_methods={"fits": fitted, "missing": fits.missing},
         training={"recipe": recipe.name}
         | {name: getattr(run, name) for name in ("seconds", "device", "seed", "peak", "ok")},
         tails=None if tails is None else tails.model_dump(exclude_unset=True),

@@ -191,10 +191,8 @@ class PulseFile:
             return place
         if place is not None:
             raise CpunetError(f"{self.path}: no {kind} {place}; there are {shortened(tables)}")
-        raise CpunetError(
-            f"{self.path}: {len(tables)} {kinds} ({shortened(tables)})",
-            "choose one with `table` (`sim_table`, `data_table`)",
-        )
+        remedy = "choose one with `table` (`sim_table`, `data_table`)"
+        raise CpunetError(f"{self.path}: {len(tables)} {kinds} ({shortened(tables)})", remedy)
 
     def open(self) -> PulseSource:
         """Open the file, or the pulses in memory; see `cpunet.open_pulses`."""

@@ -11,7 +11,7 @@ import logging
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TypeAlias, TypeGuard
 
 import h5py
 import numpy as np
@@ -27,7 +27,8 @@ from cpunet.tables import shortened
 _PREFERRED = ("waveform", "waveform_windowed")
 log = logging.getLogger(__name__)
 
-_Folder = tuple[str, dict[str, h5py.Group | h5py.Dataset], list[str], list[str]]
+Item: TypeAlias = h5py.Group | h5py.Dataset
+_Folder = tuple[str, dict[str, Item], list[str], list[str]]
 
 # plain datasets, in order of preference
 _PLAIN = ("waveform", "waveforms", "values", "raw_waveform")
@@ -58,10 +59,8 @@ def read_hdf5(options: PulseFile) -> PulseSource:
             lengths = np.diff(np.asarray(sized[:], np.int64), prepend=0)
             length = int(lengths.max())
             if lengths.min() < length:
-                log.info(
-                    f"{path.name}: pulses of {lengths.min()} to {length} samples are "
-                    "continued with their last value"
-                )
+                span = f"{lengths.min()} to {length} samples"
+                log.info(f"{path.name}: pulses of {span} are continued with their last value")
 
         def rows(start: int, stop: int) -> npt.NDArray[Any]:
             with h5.one_line(path):
@@ -73,9 +72,7 @@ def read_hdf5(options: PulseFile) -> PulseSource:
         )  # fmt: skip
 
 
-def _traces(
-    item: h5py.Group | h5py.Dataset, length: int | None, start: int, stop: int
-) -> npt.NDArray[Any]:
+def _traces(item: Item, length: int | None, start: int, stop: int) -> npt.NDArray[Any]:
     """Rows of traces; vectors of their own lengths are continued to `length` samples."""
     plain = isinstance(item, h5py.Dataset)
     values = item[start:stop] if plain else h5.lh5_rows(item, start, stop - start)
@@ -167,10 +164,8 @@ def _is_array(item: object) -> TypeGuard[h5py.Dataset]:
 
 def waveform_tables(file: h5py.File) -> list[str]:
     """Paths of the tables that contain waveforms, sorted, and of links that lead nowhere."""
-    folders = [
-        (broken, [path] if waveforms else []) for path, _, waveforms, broken in _folders(file)
-    ]
-    return sorted({path for broken, table in folders for path in broken or table})
+    places = [lost or ([path] if held else []) for path, _, held, lost in _folders(file)]
+    return sorted({place for some in places for place in some})
 
 
 def channel_tables(path: Path) -> list[str]:
@@ -202,7 +197,7 @@ def _folders(
     if (info.fileno, info.addr) in seen:
         return
     seen.add((info.fileno, info.addr))
-    items, broken = dict[str, h5py.Group | h5py.Dataset](), list[str]()
+    items, broken = dict[str, Item](), list[str]()
     for name in group:
         try:
             items[name] = h5.item_at(group, name)
@@ -274,10 +269,8 @@ def column_elsewhere(source: PulseSource, column: str) -> Column:
         return theirs
     _, at, of = np.intersect1d(events, others, return_indices=True)
     if not len(at) or any(len(np.unique(keys)) < len(keys) for keys in (events, others)):
-        raise CpunetError(
-            f"{source.path}: {column} is of other events than these pulses ({key})",
-            "give the energies of the same events",
-        )
+        text = f"{source.path}: {column} is of other events than these pulses ({key})"
+        raise CpunetError(text, "give the energies of the same events")
     log.info(
         f"{source.path.name}: {column} is in another order or of other events; joined by "
         f"{key}, {len(events) - len(at)} of {len(events)} pulses have no energy there"

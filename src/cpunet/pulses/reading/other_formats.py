@@ -97,18 +97,13 @@ def read_numpy(options: PulseFile) -> PulseSource:
     matrices = [n for n, v in arrays.items() if v.ndim == 2 and v.dtype.kind in "iuf"]
     if not matrices:
         held = (f"{n} {v.shape} of {v.dtype}".strip() for n, v in arrays.items())
-        raise CpunetError(
-            f"{options.path}: no waveforms in it; it holds {shortened(held)}",
-            "give an array of two dimensions (event, sample)",
-        )
+        text = f"{options.path}: no waveforms in it; it holds {shortened(held)}"
+        raise CpunetError(text, "give an array of two dimensions (event, sample)")
     usual = [name for name in _WAVEFORMS if name in matrices and options.place is None]
     name = options.chosen_of(usual or matrices, "array", "arrays of two dimensions")
     numbers = {n: v for n, v in arrays.items() if v.dtype.kind in "iufb" and n != name}
-    columns = {
-        column: Column.of(values.ravel() if values.ndim else values)
-        for column, values in numbers.items()
-        if values.ndim <= 1 or 1 in values.shape
-    }
+    numbers = {n: v for n, v in numbers.items() if v.ndim <= 1 or 1 in v.shape}
+    columns = {n: Column.of(v.ravel() if v.ndim else v) for n, v in numbers.items()}
     return _of_array(options.path, "NumPy", name, arrays[name], columns)
 
 
@@ -204,17 +199,9 @@ def read_flashcam(options: PulseFile) -> PulseSource:
         return np.array([trace for trace, _ in some], np.uint16).reshape(-1, length)
 
     times = {"dt": Column.of(np.asarray(period_ns), "ns")} if period_ns > 0 else {}
-    return PulseSource(
-        path,
-        "FlashCam",
-        name,
-        None,
-        length,
-        rows,
-        times=times,
-        of_each={"event_number": numbers},
-        close=stream.close,
-    )
+    source = PulseSource(path, "FlashCam", name, None, length, rows, times=times)
+    source.of_each["event_number"], source.close = numbers, stream.close
+    return source
 
 
 def _events(
@@ -235,10 +222,8 @@ def _events(
         if is_event and len(row := np.flatnonzero(event.trace_list == channel)):
             last = event.trace[row[0]].copy(), int(event.eventnumber)
             if (samples := len(last[0])) != length:
-                raise CpunetError(
-                    f"{path}: event {last[1]}: {samples} samples, before it {length}; split "
-                    "the file by length"
-                )
+                text = f"{path}: event {last[1]}: {samples} samples, before it {length}"
+                raise CpunetError(text, "split the file by length")
     # The library also reports an error if nothing follows the configuration, and from
     # 0.9 on none where a file is cut off.
     size = 0 if path.suffix in (".gz", ".zst") else path.stat().st_size

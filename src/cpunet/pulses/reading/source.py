@@ -18,7 +18,7 @@ import numpy as np
 import numpy.typing as npt
 
 from cpunet.errors import CpunetError
-from cpunet.pulses.container import Pulses
+from cpunet.pulses.container import Pulses, Rows
 from cpunet.tables import shortened
 from cpunet.units import factor, unit_names
 
@@ -102,14 +102,14 @@ class Column:
         """All values, which are read when they are asked for."""
         return self.load()
 
-    def at(self, rows: npt.NDArray[np.int64], n: int | None) -> Column:
+    def at(self, rows: Rows, n: int | None) -> Column:
         """The values of some of `n` rows; a number for all stays."""
         if self.size != n:
             return self
         return Column(lambda: self.values[rows], len(rows), self.units)
 
 
-def some_of(read: Read, rows: npt.NDArray[np.int64], start: int, stop: int) -> Values:
+def some_of(read: Read, rows: Rows, start: int, stop: int) -> Values:
     """Rows of a first to one before a last of those chosen, never more at once than these."""
     wanted, parts = rows[start:stop], list[Values]()
     while len(wanted):
@@ -167,9 +167,7 @@ def labels(columns: Mapping[str, Values], names: Iterable[str]) -> Texts:
     return np.asarray(reduce(lambda label, part: add(add(label, ","), part), parts), np.str_)
 
 
-def parts(
-    columns: Mapping[str, Column], rows: npt.NDArray[np.int64]
-) -> tuple[list[str], list[str]]:
+def parts(columns: Mapping[str, Column], rows: Rows) -> tuple[list[str], list[str]]:
     """The columns that part some rows, see `dividing`, and the labels of the parts."""
     of = {name: np.atleast_1d(c.values)[rows] for name, c in columns.items() if divides(name)}
     names = dividing(of, len(rows))
@@ -199,10 +197,8 @@ def whole_numbers(values: Values, where: str, start: int = 0) -> npt.NDArray[np.
         bad = ~((numbers == np.rint(numbers)) & (np.abs(numbers) < _MAX_NUMBER))
         if bad.any():
             row = int(bad.argmax())
-            raise CpunetError(
-                f"{where}: row {start + row}: {values[row]} is no number of an event; number "
-                "the events anew"
-            )
+            text = f"{where}: row {start + row}: {values[row]} is no number of an event"
+            raise CpunetError(text, "number the events anew")
     return values.astype(np.int64)
 
 
@@ -264,7 +260,7 @@ class PulseSource(AbstractContextManager["PulseSource"]):
     of_each: dict[str, Any] = field(default_factory=dict)
     group: h5py.Group | None = None
     close: Callable[[], None] = lambda: None
-    chosen: npt.NDArray[np.int64] | None = field(default=None, init=False)
+    chosen: Rows | None = field(default=None, init=False)
     n_all: int | None = field(default=None, init=False)
     dt_ns: float = field(default=np.nan, init=False)
     energies: str = field(default="", init=False)
@@ -280,16 +276,12 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         """
         n, sizes = self.n_pulses, {column.size for column in self.columns.values()}
         if n == 0 or self.length == 0:
-            raise CpunetError(
-                f"{self.path}: {self.name or self.format} holds no pulses; "
-                "give a file with events"
-            )
+            text = f"{self.path}: {self.name or self.format} holds no pulses"
+            raise CpunetError(text, "give a file with events")
         if self.length in sizes and n not in sizes:  # as Julia and MATLAB write arrays
-            raise CpunetError(
-                f"{self.path}: traces of shape {(n, self.length)} with columns of "
-                f"{self.length}: their dimensions are reversed",
-                "write them transposed, with the pulses first",
-            )
+            text = f"traces of shape {(n, self.length)} with columns of {self.length}"
+            remedy = "write them transposed, with the pulses first"
+            raise CpunetError(f"{self.path}: {text}: their dimensions are reversed", remedy)
         if n is not None:
             self._choose(file.rows, n)
         self._sample(file.dt_ns)
@@ -305,10 +297,8 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         """Values of a column, which must be as many as there are traces, or one for all."""
         values, n = column.values, self.n_pulses
         if n is not None and values.shape not in ((), (n,)):
-            raise CpunetError(
-                f"{self.path}: column {name} has {len(values)} values for {n} waveforms; "
-                "give the column of the same events"
-            )
+            text = f"{self.path}: column {name} has {len(values)} values for {n} waveforms"
+            raise CpunetError(text, "give the column of the same events")
         return np.atleast_1d(values) if n is None else np.broadcast_to(values, (n,))
 
     def _choose(self, wanted: Mapping[str, str], n: int) -> None:
@@ -368,15 +358,11 @@ class PulseSource(AbstractContextManager["PulseSource"]):
         self.dt_ns = period = float(periods.flat[0])
         is_period = np.isfinite(period) and period > 0
         if dt_ns is None and not is_period:
-            raise CpunetError(
-                f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns",
-                "give `dt_ns`",
-            )
+            text = f"{self.path}: event 0: the sampling period ({name}) is {period:g} ns"
+            raise CpunetError(text, "give `dt_ns`")
         if dt_ns is not None and not np.isclose(period, dt_ns, rtol=TOLERANCE, atol=0):
-            log.warning(
-                f"{self.path.name}: says that it is sampled every {period:g} ns; taken as "
-                f"{dt_ns:g} ns, as given (`dt_ns`)"
-            )
+            text = f"says that it is sampled every {period:g} ns; taken as {dt_ns:g} ns"
+            log.warning(f"{self.path.name}: {text}, as given (`dt_ns`)")
             self.dt_ns = dt_ns
         if column.size > 1 and is_period:  # a single value applies to all events
             self.of_each["dt_ns"] = periods * (self.dt_ns / period)
@@ -402,17 +388,13 @@ class PulseSource(AbstractContextManager["PulseSource"]):
 
             column = hdf5.column_elsewhere(self, name)
         if column is None:
-            raise CpunetError(
-                f"{self.path}: no column {name} for the energy; there are "
-                f"{shortened(self.columns)}"
-            )
+            text = f"no column {name} for the energy; there are {shortened(self.columns)}"
+            raise CpunetError(f"{self.path}: {text}")
         units = column.units or ("keV" if _NAMED_IN_KEV.search(name) else "")
         by, rule = factor(units, "keV"), f"column {name} [{units}]"
         if by is not None and kev_per_adc is not None:
-            log.warning(
-                f"{self.path.name}: column {name} is in {units}; its energies are "
-                f"multiplied by {kev_per_adc:g}, as given (`kev_per_adc`)"
-            )
+            text = f"is in {units}; its energies are multiplied by {kev_per_adc:g}"
+            log.warning(f"{self.path.name}: column {name} {text}, as given (`kev_per_adc`)")
             by, rule = by * kev_per_adc, f"{rule} x {kev_per_adc:g}"
         elif kev_per_adc is not None:
             by, rule = kev_per_adc, f"column {name} x {kev_per_adc:g} keV/ADC"
@@ -443,52 +425,38 @@ class PulseSource(AbstractContextManager["PulseSource"]):
             sampling period.
         """
         size, start = min(size, max(1, BLOCK_BYTES // (4 * self.length))), 0
-        while start != self.n_pulses and len(pulses := self._pulses(start, start + size)):
+        while start != self.n_pulses and len(pulses := self.read(start, start + size)):
             yield pulses
             start += len(pulses)
         if start == 0:
             raise CpunetError(f"{self.path}: holds no pulses; give a file with events")
         if (energies := len(self.of_each.get("energy_kev", range(start)))) != start:
-            raise CpunetError(
-                f"{self.path}: {start} waveforms, but {energies} energies; "
-                "give the energies of the same events"
-            )
+            text = f"{self.path}: {start} waveforms, but {energies} energies"
+            raise CpunetError(text, "give the energies of the same events")
 
     def read(self, start: int = 0, stop: int | None = None) -> Pulses:
         """Read all pulses of the file, or some rows, at once; they must fit in memory."""
         if stop is None:
-            return Pulses.concatenate(list(self.blocks()))
-        return self._pulses(start, stop)
-
-    def _pulses(self, start: int, stop: int) -> Pulses:
-        """Traces of some rows with their energies, numbers and times."""
+            return Pulses.concatenate(list(self.blocks()))[start:]
         with np.errstate(over="ignore"):  # samples beyond the range of float32 become infinite
             waveforms = np.asarray(self.rows(start, stop), np.float32)
         n = len(waveforms)
         of_each = {name: values[start : start + n] for name, values in self.of_each.items()}
         numbers = of_each.get("event_number", np.arange(start, start + n))
-        energy_kev = of_each.get("energy_kev")
-        if energy_kev is None and self.kev_per_adc is not None:
-            energy_kev = self.kev_per_adc * amplitude(waveforms)
-        if energy_kev is not None and len(energy_kev) != n:
-            raise CpunetError(
-                f"{self.path}: event {numbers[len(energy_kev)]} has no energy; "
-                "give the energies of the same events"
-            )
+        kev, t0_ns = of_each.get("energy_kev"), of_each.get("t0_ns", 0.0)
+        if kev is None and self.kev_per_adc is not None:
+            kev = self.kev_per_adc * amplitude(waveforms)
+        if kev is not None and len(kev) != n:
+            remedy = "give the energies of the same events"
+            raise CpunetError(f"{self.path}: event {numbers[len(kev)]} has no energy", remedy)
         event_number = whole_numbers(np.asarray(numbers), f"{self.path}: event_number", start)
         periods = of_each.get("dt_ns", np.full(n, self.dt_ns))
         other = ~np.isclose(periods, self.dt_ns, rtol=TOLERANCE, atol=0)
         if other.any():
             first = int(other.argmax())
-            raise CpunetError(
-                f"{self.path}: event {event_number[first]}: sampling period "
-                f"{periods[first]:g} ns, before it {self.dt_ns:g} ns; "
-                "split the file by sampling period"
-            )
+            text = f"sampling period {periods[first]:g} ns, before it {self.dt_ns:g} ns"
+            remedy = "split the file by sampling period"
+            raise CpunetError(f"{self.path}: event {event_number[first]}: {text}", remedy)
         return Pulses.of(
-            waveforms,
-            dt_ns=self.dt_ns,
-            energy_kev=energy_kev,
-            event_number=event_number,
-            t0_ns=of_each.get("t0_ns", 0.0),
+            waveforms, dt_ns=self.dt_ns, energy_kev=kev, event_number=event_number, t0_ns=t0_ns
         )
