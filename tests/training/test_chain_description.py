@@ -19,7 +19,13 @@ from cpunet.electronics.chain import Electronics, read_electronics
 from cpunet.errors import CpunetError
 from cpunet.networks.generators import ResponseGenerator
 from cpunet.networks.response_layer import ElectronicsResponse
-from cpunet.training.chain_description import learned_chain, moved_along_axes, true_chain_of
+from cpunet.training.chain_description import (
+    FEW_AXES,
+    error_ends,
+    learned_chain,
+    moved_along_axes,
+    true_chain_of,
+)
 from cpunet.training.chain_fit import by_name, vector_of
 from cpunet.training.response import Response, response
 from cpunet.training.run import Run
@@ -87,6 +93,30 @@ def run(tmp_path: Path) -> Path:
 
 def values(*runs: Path) -> dict[str, float]:
     return response(*runs).runs[0].values
+
+
+def test_few_axes_have_the_errors_of_edges_and_of_tails():
+    """Those of tails are a hundred times smaller, but alike at all samples."""
+    response = ElectronicsResponse(
+        FEW.matching[0].model_copy(update={"deviations": True}), DT_NS
+    )
+    draws, rng = response.deviation_draws, np.random.default_rng(0)
+    n, lags = draws.shape
+    edges = (
+        1e-3
+        * np.exp(-np.arange(lags) / 30)
+        * np.cos(np.outer(np.arange(1, 9), np.arange(lags)))
+    )
+    tail = 1e-5 * np.linspace(0, 1, lags)
+    draws[:] = (rng.normal(size=(n, 8)) @ edges + np.outer(rng.normal(size=n), tail)) / n**0.5
+
+    def variances(**how: bool) -> np.ndarray:
+        ends = error_ends(response, [], **how)
+        moves = np.array([0.5 * (a.deviation - b.deviation) for a, b in ends])
+        assert len(moves) == (2 * FEW_AXES if how else n)
+        return np.array([np.sum((moves @ edges[0]) ** 2), np.sum(moves[:, -1] ** 2)])
+
+    assert variances(few=True) == pytest.approx(variances(), rel=0.05)
 
 
 def test_a_single_pole_and_a_single_decay(tmp_path):

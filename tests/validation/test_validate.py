@@ -12,12 +12,13 @@ import pytest
 import cpunet
 from cpunet.errors import CpunetError
 from cpunet.pulses.container import Pulses
+from cpunet.pulses.preparation import prepare
 from cpunet.pulses.reading.files import PulseFile
 from cpunet.training.published import UNKNOWN
 from cpunet.training.run import Run
 from cpunet.training.train import train
 from cpunet.validation.drawings import drawings
-from cpunet.validation.methods import pair_squares, scores_of_squares
+from cpunet.validation.methods import pair_squares, passing_cuts, scores_of_squares
 from cpunet.validation.metrics import ALARM
 from cpunet.validation.peaks import classifier_excess, fit_ends
 from cpunet.validation.validate import Evaluation, _compared, evaluate, validate
@@ -160,6 +161,19 @@ def test_pulses_are_there_by_method_and_with_the_noise_of_the_seed(found):
     how = {"energy_kev": of.energy_kev["raw"], "generator": np.random.default_rng(0)}
     again = of.ren.apply(of.windows["raw"], **how)
     np.testing.assert_array_equal(pulses["ren"], again[raw])
+
+
+def test_translated_pulses_pass_the_cuts_of_the_data(files):
+    raw, pulses = files["data"].open().read(), RECIPE.at(16).preparation
+    tails = slice(700, None)
+    late = raw.waveforms.copy()
+    late[:5, tails] += 300 * (1 - np.exp(-np.arange(late.shape[1] - 700) / 100))
+    ready = prepare(raw.with_waveforms(late), pulses, "measured").pulses
+    passed = passing_cuts(ready, RECIPE.at(16))
+    assert not passed[:5].any()
+    assert passed[5:].mean() > 0.98
+    ready.waveforms[-1] = np.nan  # cannot be prepared
+    assert passing_cuts(ready, RECIPE.at(16)).tolist() == [*passed[:-1].tolist(), False]
 
 
 def test_errors_of_the_fit_are_in_the_p_of_the_classifier(run, found):

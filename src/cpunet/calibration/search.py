@@ -77,7 +77,6 @@ class Search:
 
     def __post_init__(self) -> None:
         self._sides = self.sets.sides()
-        self._functions = self._compared(1.0)
         physics, recipe = self.simulator.physics, self.sets.recipe
         n, knowledge = len(physics.nuisances), depletion(physics)
         self._all, self._simulated = list(range(n)), np.zeros(n)
@@ -88,6 +87,8 @@ class Search:
         # the chain alone, with the physics as simulated
         few = [sides.of(training.search_pulses) for sides in self._sides]
         self._chain = fit_chain(copy.deepcopy(start), few, Fitter(training)).response
+        self._sides = [sides.like_data(self._chain) for sides in self._sides]
+        self._functions = self._compared(1.0)
         # of a chain, pulses near a point, free coordinates, and functions
         self._problem = partial(JointProblem, recipe=recipe, start=start, knowledge=knowledge)
         # of a usual search: derivatives take two each, of the first parameters, and of all

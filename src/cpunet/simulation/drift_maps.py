@@ -195,7 +195,9 @@ class DriftMaps(NamedTuple):
     trapping_per_ns: FloatArray
 
 
-def drift_maps(fields: FieldMaps, kelvin: float, settings: SimulationSettings) -> DriftMaps:
+def drift_maps(
+    fields: FieldMaps, temperature_K: float, settings: SimulationSettings
+) -> DriftMaps:
     """Prepare field maps for the drift: extrapolated into contacts, refined if coarse.
 
     Of the `settings`, only the velocity factors and trapping rates are used.
@@ -228,7 +230,7 @@ def drift_maps(fields: FieldMaps, kelvin: float, settings: SimulationSettings) -
         # nodes at the corners of the cells of the ditch
         ditch = ~_all_corners(~np.pad(np.kron(_all_corners(ditch), fine), 1))
         usable = np.kron(usable, fine)
-    coefficients, per_field = velocity_table(kelvin, settings)
+    coefficients, per_field = velocity_table(temperature_K, settings)
     per_us = settings.electron_trapping_per_us, settings.hole_trapping_per_us
     return DriftMaps(
         values=np.ascontiguousarray(values),

@@ -185,12 +185,9 @@ class Comparison:
 
         It is 0 within a sample of the half height, where all pulses are aligned.
         """
-        single = self.sides.single(self.noisy[0])
-        if single.sum() < 2:  # far from the data
-            single[:] = True
-        n, noise = len(self.sides.data), self.views[0][single] - self.clean[single]
+        n, noise = len(self.sides.data), self.views[0] - self.clean
         rms = np.sqrt(np.mean(noise**2, axis=0, dtype=float))
-        whole = Slice(self, np.ones(n), np.ones((len(self.noisy), 1)) * single, rms)
+        whole = Slice(self, np.ones(n), np.ones((len(self.noisy), len(self.sides))), rms)
         variance = whole.shapes.diagonal() * (1 / whole.number + 1 / n)
         variance = variance + whole.noise.diagonal() * (1 / n + whole.left)
         means = whole.noisy.mean(axis=(0, 1)), whole.data.mean(axis=0)

@@ -14,7 +14,7 @@ from cpunet.networks.response_layer import Spectrum
 from cpunet.pulses.container import FloatArray
 from cpunet.training.aligned import Aligned, Changes, Derivatives, Floats, Values
 from cpunet.training.comparison import Difference
-from cpunet.training.pulse_sets import MOSTLY, Sides
+from cpunet.training.pulse_sets import Sides
 
 COMPONENTS, SEGMENTS, BINS = 24, 20, 16
 CLIPPED = 4.0  # robust standard deviations at which components and segments are clipped
@@ -126,10 +126,7 @@ class Joint:
         """
         clean, heights = self.sides.translated(transfer)
         noisy = self.sides.noisy(clean, heights)
-        # without those on the tail of another, as the data; far from the data all
-        single = np.all([self.sides.single(draw) for draw in noisy], axis=0)
-        single = single if single.mean() > MOSTLY else np.ones_like(single)
-        each = [self._functions(draw[single]) for draw in noisy]
+        each = [self._functions(draw) for draw in noisy]
         covariance = self.covariance(0.5 * (np.cov(each[0].T) + np.cov(self.data.T)))
         values = np.mean(each, axis=0)
         off = values.mean(axis=0) - self.data.mean(axis=0)
@@ -141,7 +138,7 @@ class Joint:
             moves.append(Changes(self.sides, noisy[0], records))
         of_each = np.concatenate([self._each(noisy[0], some) for some in moves], axis=2)
         of_log = np.concatenate([some.log_amplitude for some in moves], axis=1)
-        parts = np.array_split(np.flatnonzero(single), PARTS)
+        parts = np.array_split(np.arange(len(clean)), PARTS)
         slopes = np.array([self._slopes(noisy[0][of], of_each[of], of_log[of]) for of in parts])
         means = np.array([part.mean(axis=0) for part in np.array_split(values, PARTS)])
         return Difference(off, covariance, slopes.mean(axis=0), (slopes, means))

@@ -173,9 +173,7 @@ class Sides:
         late = every.pulses[:, self.late]
         self.middle = np.median(late, axis=0)
         self.spread = np.median(np.abs(late - self.middle), axis=0)
-        tails = self.tails(every)
-        self.usual = np.median(tails, axis=0)
-        self.widest = FAR * 1.4826 * np.median(np.abs(tails - self.usual), axis=0)
+        self.widest = FAR * 1.4826 * np.median(np.abs(self.tails(every)), axis=0)
         single = self.single(every)
         self.data, self.left_out = every[single], int((~single).sum())
         self.divide()
@@ -246,21 +244,22 @@ class Sides:
         return some
 
     def tails(self, aligned: Aligned) -> Values:
-        """Slope and RMS of the tail of each pulse about the median, shape (pulses, 2)."""
+        """Slope and RMS of each tail, less those of most pulses, shape (pulses, 2)."""
         deviation = (aligned.pulses[:, self.late] - self.middle) / self.spread
         slope = deviation @ np.linspace(-1.0, 1.0, deviation.shape[1])
-        return np.column_stack([slope, np.sqrt((deviation**2).mean(axis=1))])
+        both = np.column_stack([slope, np.sqrt((deviation**2).mean(axis=1))])
+        return np.asarray(both - np.median(both, axis=0))
 
     def single(self, aligned: Aligned) -> npt.NDArray[np.bool_]:
-        """Which pulses have no other before them or on their tail, and are collected by then."""
+        """Which pulses have no other before them or on their tail, and are collected early."""
         base = aligned.pulses[:, : self.frame.before // 4].mean(axis=1)
-        near: npt.NDArray[np.bool_] = np.abs(self.tails(aligned) - self.usual) < self.widest
-        return near.all(axis=1) & (np.abs(base) < QUIET)
+        near = np.abs(self.tails(aligned)) < self.widest
+        return np.asarray(near.all(axis=1) & (np.abs(base) < QUIET))
 
     def like_data(self, response: ElectronicsResponse) -> Sides:
-        """Without the simulated pulses that cuts would leave out behind a response."""
-        clean, heights = self.translated(response.transfer(self.padded))
-        single = self.single(self.read(clean, heights, 0))
+        """Without the simulated pulses that are not single behind a response."""
+        drawn = self.noisy(*self.translated(response.transfer(self.padded)))
+        single = np.all([self.single(draw) for draw in drawn], axis=0)
         return self.of_events(single) if single.mean() > MOSTLY else self
 
     def view(self, aligned: Floats) -> Floats:

@@ -81,6 +81,9 @@ def fit_response(
         if not chains[-1].poor:
             break  # no other valley to search for
     nearest = min(chains, key=lambda chain: chain.chi_square)
+    # pulses that are collected late, or on the tail of another, do not pass cuts
+    bands = [sides.like_data(nearest.response) for sides in bands]
+    nearest = fit_chain(nearest.response, bands, fitter, search=False)
     best = _learned(nearest, bands, fitter)
     # of few pulses, the onset is not off for sure, but nothing else is either
     if not best.checks.good and (not best.checks.off or "onset" in best.checks.off):
@@ -119,7 +122,7 @@ def fit_response(
 def _learned(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned:
     """Learn what a chain does not do, by the height of a pulse if heights differ."""
     response = chain.response
-    around = [sides.entering(response).like_data(response) for sides in bands]
+    around = [sides.entering(response) for sides in bands]
     alone = _Learned(chain, response, *verdict(response, around))
     # behind a stretched drift, deviations would make up for what is left of other physics
     linear = response.drift is None and response.by_height is None
@@ -132,7 +135,7 @@ def _learned(chain: Fitted, bands: Sequence[Sides], fitter: Fitter) -> _Learned:
         if tried and tried[0].checks.good:
             return tried[0]
     deviated, _ = with_deviations(response, around, fitter.count)
-    around = [sides.entering(deviated).like_data(deviated) for sides in bands]
+    around = [sides.entering(deviated) for sides in bands]
     tried.append(_Learned(chain, deviated, *verdict(deviated, around)))
     return min(tried, key=lambda learned: learned.checks.chi_square)
 

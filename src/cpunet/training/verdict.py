@@ -224,8 +224,7 @@ def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> tuple[Verd
         of_amplitude, *others = here.differences()
         quantiles.append(of_amplitude)
         chi_squares.append(float(np.median([d.chi_square for d in others if d.sliced])))
-        translated = here.noisy[0]
-        both = sides.data, translated[sides.single(translated)]
+        both = sides.data, here.noisy[0]
         if min(map(len, both)) >= MIN_PULSES:
             more = [{"log": of.log_amplitude, "rise": of.rise} for of in both]
             pulses = (of.pulses for of in both)

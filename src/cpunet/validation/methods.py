@@ -32,7 +32,9 @@ from cpunet.pulses.container import Flags, FloatArray, Pulses, blocks
 from cpunet.pulses.loading import InputSet
 from cpunet.pulses.parameters import Values, aligned_block, current_amplitude
 from cpunet.pulses.peaks import EnergySelection
+from cpunet.pulses.preparation import apply_cuts, fit_cuts, prepare
 from cpunet.pulses.reading.other_formats import read_arrays
+from cpunet.recipes.schema import Recipe
 from cpunet.translation.translator import REN
 from cpunet.validation.metrics import PairedScores
 
@@ -204,7 +206,7 @@ class Translations:
     windows
         Windows with noise by method: ``data``, ``raw``, baseline methods, ``ren`` and
         ``truth``; of translations only ``ren`` if the noise of the data is unknown.  Rows that
-        cannot be prepared are NaN.
+        cannot be prepared, or do not pass cuts as those of the data, are NaN.
     whole, energy_kev, amplitudes
         Mask of the prepared rows, energies and current amplitudes, by method.
     comparable
@@ -297,12 +299,27 @@ def translate_all(
     for name in (*baselines.methods, "ren", "truth"):  # from the simplest to the truth
         if name in noisy:
             every[name] = np.concatenate(noisy.pop(name))
+            if noise is not None:
+                every[name][~passing_cuts(pulses.with_waveforms(every[name]), recipe)] = np.nan
     whole = {m: np.asarray(np.isfinite(w).all(axis=1)) for m, w in every.items()}
     kev = {m: measured.energy_kev if m == "data" else pulses.energy_kev for m in every}
     amplitudes = {method: current_amplitude(w, ren.dt_ns) for method, w in every.items()}
     of_pairs = {method: np.concatenate(of_method) for method, of_method in squares.items()}
     of_all, shapes = np.concatenate(comparable), np.concatenate(truth) if truth else None
     return Translations(ren, baselines, every, whole, kev, amplitudes, of_all, of_pairs, shapes)
+
+
+def passing_cuts(translated: Pulses, recipe: Recipe) -> Flags:
+    """Which translated pulses with noise pass cuts that are derived as those of the data.
+
+    Pulses that are collected late look like piled-up ones.
+    """
+    ready = prepare(translated, recipe.preparation, "measured")
+    ready = replace(ready, scale=ready.pulses.energy_kev)
+    passed = np.zeros(len(translated), bool)
+    if len(ready):
+        passed[apply_cuts(ready, fit_cuts(ready, recipe.cuts)).index] = True
+    return passed
 
 
 def like_data(ren: REN, pulses: Pulses, generator: np.random.Generator) -> FloatArray:
