@@ -83,7 +83,8 @@ def fit_response(
     nearest = min(chains, key=lambda chain: chain.chi_square)
     # pulses that are collected late, or on the tail of another, do not pass cuts
     bands = [sides.like_data(nearest.response) for sides in bands]
-    nearest = fit_chain(nearest.response, bands, fitter, search=False)
+    if not nearest.poor:
+        nearest = fit_chain(nearest.response, bands, fitter, search=False)
     best = _learned(nearest, bands, fitter)
     # of few pulses, the onset is not off for sure, but nothing else is either
     if not best.checks.good and (not best.checks.off or "onset" in best.checks.off):
