@@ -17,6 +17,7 @@ from cpunet.settings import Config, checked, read_values
 from cpunet.simulation.fields import solve
 from cpunet.simulation.geometry import Detector
 from cpunet.simulation.settings import SimulationSettings
+from cpunet.simulation.simulator import BOLTZMANN_V_PER_K
 
 Values = npt.NDArray[np.float64]
 
@@ -167,7 +168,10 @@ class Physics:
         """Simulated value; 1 for a factor that is not in the settings."""
         values = {**dict(self.settings), **dict(self.detector), "impurity_scale": 1.0}
         value = values[nuisance.field or nuisance.name]
-        of_words = {"siggen": 0.12, "temperature": 8.617333e-4 * self.detector.temperature_K}
+        of_words = {
+            "siggen": 0.12,
+            "temperature": 10.0 * BOLTZMANN_V_PER_K * self.detector.temperature_K,
+        }
         return float(of_words.get(value, value))
 
     def values(self, coordinates: Values) -> dict[str, float]:
