@@ -18,8 +18,10 @@ from cpunet.pulses.peaks import EnergySelection, label_peaks, parse_selection
 from cpunet.recipes.schema import PeakConfig, Recipe
 from cpunet.training.aligned import Samples, Values
 
-# Ratio of the limits of a band; the next is used only if no band of the previous is possible.
-WIDEST = (1.3, 2.0, 4.0, np.inf)
+# Ratios of the limits of a band: the first with enough pulses; the next are used only if no
+# band of the previous is possible.  What acts by height, as a curve of seven waves in the range
+# of a digitiser, averages out in wide ones.
+WIDEST = (1.1, 1.3), (2.0,), (4.0,), (np.inf,)
 # Maximum number of slices of a band in which the spectra are matched, and pulses in a slice.
 SLICES, IN_SLICE = 32, 50
 # The continuum begins where noise is small, and ends well before a line and its sidebands.
@@ -75,7 +77,7 @@ def energy_bands(
     >>> sim = np.r_[np.full(500, 2614.5), np.linspace(1000, 1200, 900)]
     >>> data = np.r_[np.full(400, 2614.0), np.linspace(1000, 1200, 800)]
     >>> [(b.name, len(b.sim), len(b.data)) for b in energy_bands(sim, data, lines)]
-    [('FEP', 500, 400), ('1000-1200 keV', 900, 800)]
+    [('FEP', 500, 400), ('1091-1200 keV', 491, 436), ('1000-1091 keV', 409, 363)]
     """
     bands, energies = list[EnergyBand](), (sim_kev, data_kev)
     labels = [label_peaks(side, peaks) for side in energies]
@@ -86,15 +88,17 @@ def energy_bands(
     # pulses that are not in a line, from the highest energy down
     inside = [band.name for band in bands]
     others = [np.flatnonzero(~np.isin(of, inside)) for of in labels]
-    for widest in WIDEST:
+    for ratios in WIDEST:
         rows = [r[np.argsort(-e[r])] for r, e in zip(others, energies, strict=True)]
         while min(map(len, rows)):
             top = min(e[r[0]] for r, e in zip(rows, energies, strict=True))
             rows = [r[e[r] <= top] for r, e in zip(rows, energies, strict=True)]
-            both = zip(rows, energies, strict=True)
-            counts = [int((e[r] >= top / widest).sum()) for r, e in both]
+            for ratio in ratios:
+                both = zip(rows, energies, strict=True)
+                counts = [int((e[r] >= top / ratio).sum()) for r, e in both]
+                if enough := min(counts) >= MIN_PULSES:
+                    break
             left = [len(r) - n for r, n in zip(rows, counts, strict=True)]
-            enough = min(counts) >= MIN_PULSES
             if enough and min(left) < MIN_PULSES and max(left) < 2 * MIN_PULSES:
                 counts = [len(r) for r in rows]  # include a small remainder
             if enough:

@@ -31,7 +31,7 @@ from cpunet.training.energy_bands import (
     spectrum_weights,
 )
 
-MOST = 4096  # pulses of a side that are compared
+MOST, IN_BAND = 4096, 1536  # pulses of a side that are compared, and of a band of a continuum
 NOISES = 1000  # draws of noise that few pulses have, for a covariance
 DRAWN = 8192  # pulses that give the slope of the tails
 # Maximum number of noise traces, each twice as long as a record.  For more pulses,
@@ -363,11 +363,12 @@ class PulseSets:
         return [self._sides(sim, data, EnergyBand(SINGLE, rows[0], rows[1], weights))]
 
     def _sides(self, sim: Pulses, data: Pulses, band: EnergyBand) -> Sides:
-        rows, weights = band.sim[:MOST], band.weights[:MOST]
+        most = MOST if band.name in {SINGLE, *self.recipe.peaks} else IN_BAND
+        rows, weights = band.sim[:most], band.weights[:most]
         if np.ptp(weights) > 0:  # each as often as its weight says, to a whole number
             share = np.cumsum(weights) / weights.sum()
             rows = rows[np.searchsorted(share, (np.arange(len(rows)) + 0.5) / len(rows))]
-        sim, measured = sim[rows], data.waveforms[band.data[:MOST]]
+        sim, measured = sim[rows], data.waveforms[band.data[:most]]
         length, pairs = record_length(sim.length, sim.dt_ns), max(1, round(NOISES / len(sim)))
         noise = Noise(self.noise, sim.energy_kev, length, pairs, self.rng)
         finite = np.isfinite(measured).all(axis=1)
