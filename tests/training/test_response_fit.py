@@ -158,8 +158,7 @@ def test_pulses_that_cuts_of_the_data_take_for_piled_up_are_compared_on_neither_
     (sides,) = PulseSets(sim, *problem[1:3], RECIPE, np.random.default_rng(0)).sides()
     left = set(range(N)) - set(sides.like_data(near.response).rows.tolist())
     assert {*rows.tolist()} <= left
-    of_data = sides.left_out  # of those that drift for long
-    assert abs(len(left) - len(rows) - of_data) < 3 * (2 * of_data) ** 0.5
+    assert abs(len(left) - len(rows) - sides.left_out) < 3 * (2 * sides.left_out) ** 0.5
 
 
 @pytest.mark.thorough
