@@ -69,7 +69,7 @@ def test_a_run_folder(tmp_path):
     fit = {"verdict": "good", "pulls": {"edge": 4.2, "tail": 1.0}, "tails": tails}
     write_run(tmp_path, {}, recipe, INFO | {"fit": fit})
     lines = dict(info(tmp_path).lines)
-    assert lines["trained"] == "recipe paper on FEP, seed 7; , 12.5 s on cpu"
+    assert lines["trained"] == "recipe paper on FEP, seed 7; 12.5 s on cpu"
     assert (lines["fit"], lines["off"]) == ("good", "edge +4.2 σ")
     assert load(tmp_path).summary() == info(tmp_path).lines
     assert lines["pile-up tails"] == "none significant"

@@ -426,12 +426,12 @@ def summary(run: Run) -> list[tuple[str, str]]:
         parameters.append(number)
     worst = sorted(fit.pulls, key=lambda name: -abs(fit.pulls[name]))[:WORST]
     off = (f"{name} {fit.pulls[name]:+.1f} σ" for name in worst if abs(fit.pulls[name]) > _FAR)
-    started = run.started[:16].replace("T", " ")
-    when = f"; {started}, {run.seconds:.4g} s on {run.device}" if started else ""
+    started = run.started[:16].replace("T", " ") + ", " * bool(run.started)
+    when = f"{started}{run.seconds:.4g} s on {run.device}"
     taken = "ns, half rise of a step; translated pulses have it taken off t0"
     lines = [
         ("run", where),
-        ("trained", f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}{when}"),
+        ("trained", f"recipe {run.recipe.name} on {run.peak}, seed {run.seed}; {when}"),
         ("simulated", sides[0]),
         ("measured", sides[1]),
         ("fit", fit.verdict),
