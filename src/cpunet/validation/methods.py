@@ -316,7 +316,8 @@ def passing_cuts(translated: Pulses, recipe: Recipe) -> Flags:
     """
     ready = prepare(translated, recipe.preparation, "measured")
     ready = replace(ready, scale=ready.pulses.energy_kev)
-    passed = np.zeros(len(translated), bool)
+    passed = np.asarray(np.isfinite(translated.waveforms).all(axis=1))
+    passed[ready.index] = False
     if len(ready):
         passed[apply_cuts(ready, fit_cuts(ready, recipe.cuts)).index] = True
     return passed
