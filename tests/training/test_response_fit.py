@@ -156,7 +156,9 @@ def test_pulses_that_cuts_of_the_data_take_for_piled_up_are_compared_on_neither_
     waveforms[rows, late:] -= 0.1 * (waveforms[rows, late:] - waveforms[rows, :-late])
     sim = problem.sim.with_waveforms(waveforms)
     (sides,) = PulseSets(sim, *problem[1:3], RECIPE, np.random.default_rng(0)).sides()
-    left = set(range(N)) - set(sides.like_data(near.response).rows.tolist())
+    cut = sides.cut_like_data(near.response)
+    left = set(range(N)) - set(cut.rows.tolist())
+    assert cut.sim_left_out == len(left)
     assert {*rows.tolist()} <= left
     assert abs(len(left) - len(rows) - sides.left_out) < 3 * (2 * sides.left_out) ** 0.5
 

@@ -168,10 +168,8 @@ class Physics:
         """Simulated value; 1 for a factor that is not in the settings."""
         values = {**dict(self.settings), **dict(self.detector), "impurity_scale": 1.0}
         value = values[nuisance.field or nuisance.name]
-        of_words = {
-            "siggen": 0.12,
-            "temperature": 10.0 * BOLTZMANN_V_PER_K * self.detector.temperature_K,
-        }
+        thermal = BOLTZMANN_V_PER_K * self.detector.temperature_K * 10.0  # mm V/cm
+        of_words = {"siggen": 0.12, "temperature": thermal}
         return float(of_words.get(value, value))
 
     def values(self, coordinates: Values) -> dict[str, float]:

@@ -87,7 +87,7 @@ class Search:
         # the chain alone, with the physics as simulated
         few = [sides.of(training.search_pulses) for sides in self._sides]
         self._chain = fit_chain(copy.deepcopy(start), few, Fitter(training)).response
-        self._sides = [sides.like_data(self._chain) for sides in self._sides]
+        self._sides = [sides.cut_like_data(self._chain) for sides in self._sides]
         self._functions = self._compared(1.0)
         # of a chain, pulses near a point, free coordinates, and functions
         self._problem = partial(JointProblem, recipe=recipe, start=start, knowledge=knowledge)

@@ -202,6 +202,9 @@ def _say(info: FitInfo) -> None:
     """Log which pulses were compared, how well the fit describes them, and why not."""
     compared = ", ".join(f"{name} {n}/{m}" for name, (n, m) in info.bands.items())
     log.info(f"compared (simulated/measured pulses): {compared}")
+    if info.sim_left_out or info.data_left_out:
+        both = f"{info.sim_left_out} simulated and {info.data_left_out} measured pulses"
+        log.info(f"left out, as piled up or collected late: {both}")
     if any(info.in_no_band.values()):
         log.info(
             "in no band, since a side has too few of their energies: "

@@ -140,8 +140,8 @@ class Sides:
         Simulated pulses, shape (pulses, samples), and the same within records.
     data, data_view
         Measured pulses that are single, and their means over the stretches.
-    left_out
-        Number of the others.
+    left_out, sim_left_out
+        Number of the other measured pulses, and of simulated ones, see `cut_like_data`.
     first, widths, time_ns
         First sample and samples of each stretch that is compared, and its middle in ns from the
         half height.
@@ -150,6 +150,7 @@ class Sides:
     """
 
     by_height: ByHeight | None = None
+    sim_left_out = 0
 
     def __init__(
         self,
@@ -256,11 +257,15 @@ class Sides:
         near = np.abs(self.tails(aligned)) < self.widest
         return np.asarray(near.all(axis=1) & (np.abs(base) < QUIET))
 
-    def like_data(self, response: ElectronicsResponse) -> Sides:
+    def cut_like_data(self, response: ElectronicsResponse) -> Sides:
         """Without the simulated pulses that are not single behind a response."""
         drawn = self.noisy(*self.translated(response.transfer(self.padded)))
         single = np.all([self.single(draw) for draw in drawn], axis=0)
-        return self.of_events(single) if single.mean() > MOSTLY else self
+        if single.mean() <= MOSTLY:
+            return self
+        others = self.of_events(single)
+        others.sim_left_out = int((~single).sum())
+        return others
 
     def view(self, aligned: Floats) -> Floats:
         """Means of aligned pulses over the stretches, shape (pulses, stretches)."""

@@ -82,7 +82,7 @@ def fit_response(
             break  # no other valley to search for
     nearest = min(chains, key=lambda chain: chain.chi_square)
     # pulses that are collected late, or on the tail of another, do not pass cuts
-    bands = [sides.like_data(nearest.response) for sides in bands]
+    bands = [sides.cut_like_data(nearest.response) for sides in bands]
     if not nearest.poor:
         nearest = fit_chain(nearest.response, bands, fitter, search=False)
     best = _learned(nearest, bands, fitter)

@@ -160,8 +160,8 @@ class FitInfo(InfoPart):
         What held-out pulses say of each part that was tried.
     bands, in_no_band
         Energies compared, with the pulses of each side; pulses of energies that a side lacks.
-    data_left_out
-        Number of measured pulses excluded: those with a piled-up pulse, or without a baseline.
+    data_left_out, sim_left_out
+        Number of pulses excluded: with a piled-up pulse, without a baseline, or collected late.
     amplitude_shift, amplitude_shift_error
         Relative change of the translated current amplitudes that would bring them closest to
         the data's.
@@ -183,6 +183,7 @@ class FitInfo(InfoPart):
     bands: dict[str, list[int]] = {}
     in_no_band: dict[str, int] = {}
     data_left_out: int = 0
+    sim_left_out: int = 0
     amplitude_shift: float | None = None
     amplitude_shift_error: float | None = None
     noise: dict[str, float] = {}
@@ -254,6 +255,7 @@ def verdict(response: ElectronicsResponse, bands: Sequence[Sides]) -> tuple[Verd
         pulls=pulls,
         bands=counts,
         data_left_out=left_out,
+        sim_left_out=sum(sides.sim_left_out for sides in bands),
         amplitude_shift=shift,
         amplitude_shift_error=error,
     )
